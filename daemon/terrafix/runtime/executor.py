@@ -12,6 +12,7 @@ import msgspec
 import zmq
 
 from terrafix.core import logs
+from terrafix.core.allocator import RETURN_S, return_free_memory
 from terrafix.core.clock import Ticker, now_ns
 from terrafix.core.log_lines import MessageLog
 from terrafix.core.node import Edge, Node, NodeContext
@@ -135,6 +136,7 @@ class LiveShell:
         self._progress = Progress(endpoints.progress(process.name))
         self._ticker = Ticker(process.tick_hz, now_ns()) if process.tick_hz > 0 else None
         self._dropped_ticker = Ticker(1e9 / DROPPED_PERIOD_NS, now_ns())
+        self._memory_ticker = Ticker(1.0 / RETURN_S, now_ns() + round(1e9 * RETURN_S))
         self._poller = zmq.Poller()
         self._poller.register(self._subscriber.socket, zmq.POLLIN)
         self._poller.register(self._publisher.socket, zmq.POLLIN)
@@ -149,6 +151,8 @@ class LiveShell:
             worked = self._step()
             self._progress.stamp(now_ns(), len(self._inbox))
             if not worked:
+                if self._memory_ticker.due(now_ns()):  # now, when nothing waits for this process
+                    return_free_memory()
                 self._wait()
         self._drain()
 

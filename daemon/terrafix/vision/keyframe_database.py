@@ -2,47 +2,84 @@
 Google", ICCV 2003; DBoW2 of ORB-SLAM).
 
 The words are SIFT descriptors of the first keyframes of the flight, so that there is no vocabulary to train or to
-deliver. The memory is bounded: where ground was seen most often, keyframes are removed, the oldest first, but no
-fragment as a whole."""
+deliver. The memory is reserved at the start and never grows: where ground was seen most often, keyframes are removed,
+the oldest first, but no fragment as a whole."""
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.vision.covisibility import COARSE_FEATURES
 from terrafix.vision.features import Features
 
-MAX_BYTES = 64 * 2**20  # of descriptors, points and rays: 1400 keyframes, 50 km at 90 m above the ground
+MAX_KEYFRAMES = 512  # 22 MiB; 18 km of new ground at 90 m above it [measured: docs/decisions/048]
 WORDS = 512
 VOCABULARY_KEYFRAMES = 8  # from whose descriptors the words are taken; before that all keyframes are candidates
+DESCRIPTOR_SIZE = 128  # [spec: SIFT]
 
 
 @dataclass(frozen=True)
 class StoredKeyframe:
-    """``features`` of the frame, with descriptors as uint8 (SIFT's are whole numbers up to 255), and their rays (N, 2),
-    normalised. ``path``: way to it within its fragment, in image widths over the ground."""
+    """``features`` of the frame, with descriptors as uint8 (SIFT's are whole numbers up to 255), and its ``histogram``
+    (WORDS,) of words, unit sum: both are valid until the keyframe is removed. ``path``: way to it within its fragment,
+    in image widths over the ground."""
 
     frame_id: int
     fragment_id: int
     path: float
     features: Features
-    rays: np.ndarray
-    histogram: np.ndarray = field(default_factory=lambda: np.zeros(WORDS, np.float32))  # of words, unit sum
+    histogram: np.ndarray
+
+
+class _Places:
+    """Memory of ``count`` keyframes, all of it written once, so that the kernel gives it now and not in the flight.
+    Arrays of one keyframe each, between those of single frames in the heap, would keep the heap from being used again
+    where they are."""
+
+    def __init__(self, count: int) -> None:
+        self._xy_px = np.full((count, COARSE_FEATURES, 2), 0.0, np.float32)
+        self._descriptors = np.full((count, COARSE_FEATURES, DESCRIPTOR_SIZE), 0, np.uint8)
+        self._angle_rad = np.full((count, COARSE_FEATURES), 0.0, np.float32)
+        self._size_px = np.full((count, COARSE_FEATURES), 0.0, np.float32)
+        self._histograms = np.full((count, WORDS), 0.0, np.float32)
+        self._free = list(range(count))
+        self._of: dict[int, int] = {}  # frame -> its place
 
     @property
     def size_bytes(self) -> int:
-        features = self.features
-        arrays = (features.xy_px, features.descriptors, features.angle_rad, features.size_px, self.rays, self.histogram)
+        arrays = (self._xy_px, self._descriptors, self._angle_rad, self._size_px, self._histograms)
         return sum(a.nbytes for a in arrays)
+
+    def put(self, frame_id: int, features: Features) -> tuple[Features, np.ndarray]:
+        """-> the features as they are stored, the strongest COARSE_FEATURES, and a histogram of zeros. A place must be
+        free."""
+        place = self._of[frame_id] = self._free.pop()
+        count = min(len(features), COARSE_FEATURES)
+        stored = Features(
+            self._xy_px[place, :count],
+            self._descriptors[place, :count],
+            self._angle_rad[place, :count],
+            self._size_px[place, :count],
+        )
+        stored.xy_px[:] = features.xy_px[:count]
+        stored.descriptors[:] = features.descriptors[:count]
+        stored.angle_rad[:] = features.angle_rad[:count]
+        stored.size_px[:] = features.size_px[:count]
+        self._histograms[place] = 0.0
+        return stored, self._histograms[place]
+
+    def remove(self, frame_id: int) -> None:
+        self._free.append(self._of.pop(frame_id))
 
 
 class KeyframeDatabase:
-    """``add`` keyframes in order of time; ``candidates`` for an image. ``max_bytes``: of all keyframes together."""
+    """``add`` keyframes in order of time; ``candidates`` for an image."""
 
-    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
-        self._max_bytes = max_bytes
-        self._size_bytes = 0
+    def __init__(self, max_keyframes: int = MAX_KEYFRAMES) -> None:
+        self._max_keyframes = max_keyframes
+        self._places = _Places(max_keyframes + 1)  # the newest is in before one is removed, which may be itself
         self._words: np.ndarray | None = None  # (WORDS, C)
         self._keyframes: dict[int, StoredKeyframe] = {}  # by frame id, oldest first
 
@@ -56,19 +93,21 @@ class KeyframeDatabase:
 
     @property
     def size_bytes(self) -> int:
-        return self._size_bytes
+        """Of all places, those that are free among them."""
+        return self._places.size_bytes
 
-    def add(self, frame_id: int, fragment_id: int, path: float, features: Features, rays: np.ndarray) -> None:
-        """``path``, ``rays``: as in StoredKeyframe; ``features`` with float descriptors."""
-        packed = Features(features.xy_px, features.descriptors.astype(np.uint8), features.angle_rad, features.size_px)
-        histogram = np.zeros(WORDS, np.float32) if self._words is None else _histogram(features, self._words)
-        keyframe = StoredKeyframe(frame_id, fragment_id, path, packed, rays, histogram)
-        self._keyframes[frame_id] = keyframe
-        self._size_bytes += keyframe.size_bytes
+    def add(self, frame_id: int, fragment_id: int, path: float, features: Features) -> None:
+        """``path``: as in StoredKeyframe; ``features`` with float descriptors, the strongest first."""
+        stored, histogram = self._places.put(frame_id, features)
+        if self._words is not None:
+            histogram[:] = _histogram(stored, self._words)
+        self._keyframes[frame_id] = StoredKeyframe(frame_id, fragment_id, path, stored, histogram)
         if self._words is None and len(self._keyframes) == VOCABULARY_KEYFRAMES:
             self._choose_words()
-        while self._size_bytes > self._max_bytes and len(self._keyframes) > 1:
-            self._size_bytes -= self._keyframes.pop(self._most_redundant()).size_bytes
+        if len(self._keyframes) > self._max_keyframes:
+            removed = self._most_redundant()
+            del self._keyframes[removed]
+            self._places.remove(removed)
 
     def candidates(
         self, features: Features, is_recent: Callable[[StoredKeyframe], bool], count: int

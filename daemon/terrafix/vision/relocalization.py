@@ -81,8 +81,7 @@ class RelocalizationSearch:
         if not registered:
             self._first = view
             return
-        rays = self._camera.normalise(view.features.xy_px).astype(np.float32)
-        self.database.add(view.frame_id, view.fragment_id, view.path, view.features, rays)
+        self.database.add(view.frame_id, view.fragment_id, view.path, view.features)
 
     def _keep_first(self, motion: Motion) -> None:
         """The first frame of a fragment is kept when another one is registered to it; else it is a foreign frame."""

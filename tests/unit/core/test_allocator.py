@@ -66,3 +66,36 @@ print(int(first), int(after), int(again), int(resident_mb() < before + (EXCESS_B
 def test_memory_is_returned_after_work_much_larger_than_usual_and_kept_otherwise() -> None:
     done = subprocess.run([sys.executable, "-c", RESIDENT], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.split() == ["0", "1", "0", "1"]
+
+
+FLAT = """
+import threading
+import numpy as np
+from terrafix.core.allocator import return_free_memory
+
+def work():
+    held = [np.ones(131_072) for _ in range(100)]  # 100 MB
+    kept.append(np.zeros(10))  # behind them: their memory is not at the end of the heap
+
+def resident_mb():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) >> 10
+
+kept = []
+before = resident_mb()
+print(int(return_free_memory()))  # there is little
+for _ in range(3):
+    work()
+    between = resident_mb()
+    print(int(return_free_memory()))
+    print(int(resident_mb() < before + 10), int(between > before + 90))
+thread = threading.Thread(target=work)
+thread.start()
+thread.join()
+print(int(return_free_memory()), int(resident_mb() < before + 10))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mallinfo2 and malloc_trim of glibc")
+def test_all_free_memory_is_returned_each_time_also_that_of_threads_unless_there_is_little() -> None:
+    done = subprocess.run([sys.executable, "-c", FLAT], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["0", *("1", "1", "1") * 3, "1", "1"]

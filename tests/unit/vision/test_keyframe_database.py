@@ -28,7 +28,7 @@ def none_recent(_: StoredKeyframe) -> bool:
 
 
 def add(database: KeyframeDatabase, frame_id: int, features: Features, fragment_id: int = 0, path: float = 0.0) -> None:
-    database.add(frame_id, fragment_id, path, features, features.xy_px)
+    database.add(frame_id, fragment_id, path, features)
 
 
 def test_a_place_is_among_the_five_most_similar_keyframes_after_a_turn_and_a_shift(places: list[Features]) -> None:
@@ -66,22 +66,41 @@ def test_stored_descriptors_are_those_of_the_image(places: list[Features]) -> No
     assert np.array_equal(stored.descriptors.astype(np.float32), places[0].descriptors)
 
 
-def test_the_memory_is_bounded_in_bytes(places: list[Features]) -> None:
-    one = KeyframeDatabase()
-    add(one, 0, places[0])
-    database = KeyframeDatabase(max_bytes=6 * one.size_bytes)
+def test_the_memory_is_reserved_at_the_start_and_stays_the_same(places: list[Features]) -> None:
+    database = KeyframeDatabase(max_keyframes=6)
+    reserved = database.size_bytes
+    held = set[int]()
+    for i in range(5 * len(places)):
+        add(database, i, places[i % len(places)], path=float(i))
+        newest = database.keyframes[-1]
+        held |= {newest.features.descriptors.ctypes.data, newest.histogram.ctypes.data}
+        assert len(database) == min(i + 1, 6)
+    assert len(held) == 2 * 7, "arrays lie in the same seven places, one of them for the newest before one is removed"
+    assert database.size_bytes == reserved == 7 * (300 * (2 * 4 + 128 + 4 + 4) + 512 * 4)
+
+
+def test_keyframes_that_stay_keep_their_features_when_others_are_removed(places: list[Features]) -> None:
+    database = KeyframeDatabase(max_keyframes=10)
     for i, features in enumerate(places):
         add(database, i, features, path=float(i))
-        assert database.size_bytes <= 6 * one.size_bytes
-        assert database.size_bytes == sum(k.size_bytes for k in database.keyframes)
-    assert 4 <= len(database) <= 7
+    for keyframe in database.keyframes:
+        of_its_image = places[keyframe.frame_id]
+        assert np.array_equal(keyframe.features.descriptors, of_its_image.descriptors)
+        assert np.array_equal(keyframe.features.xy_px, of_its_image.xy_px)
+        assert keyframe.histogram.sum() == pytest.approx(1.0)
+
+
+def test_of_an_image_with_too_many_features_the_strongest_are_kept() -> None:
+    many = features_at(SiftMatcher(500), texture(3, 1000.0), 0.0, 0.0)
+    assert len(many) > 300
+    database = KeyframeDatabase()
+    add(database, 0, many)
+    assert np.array_equal(database.keyframes[0].features.xy_px, many.xy_px[:300])
 
 
 def kept(max_keyframes: int, flown: list[tuple[int, float]], features: Features) -> list[int]:
     """Frames that are kept of keyframes (fragment, path)."""
-    one = KeyframeDatabase()
-    add(one, 0, features)
-    database = KeyframeDatabase(max_bytes=max_keyframes * one.size_bytes)
+    database = KeyframeDatabase(max_keyframes)
     for frame_id, (fragment_id, path) in enumerate(flown):
         add(database, frame_id, features, fragment_id, path)
     return [k.frame_id for k in database.keyframes]
