@@ -25,8 +25,8 @@ ACCEL_SIGMA_IMU_MPS2 = 0.4
 HEADING_SIGMA_RAD = math.radians(5.0)  # rad; heading error, rotates the inertial increments; at least [tuned]
 # With attitude alone a banked turn is known: what is left is gusts and speed changes of a plane. [tuned]
 ACCEL_SIGMA_ATTITUDE_MPS2 = 0.5
-# Share of the acceleration of a lean that is 1-sigma where the lean may, or may not, be a manoeuvre: a copter that leans
-# brakes, turns, or holds its speed against drag and wind. All of it is three sigmas. [measured: docs/link.md]
+# Share of the acceleration of a lean that is 1-sigma where the lean may, or may not, be a manoeuvre: a copter that
+# leans brakes, turns, or holds its speed against drag and wind. All of it is three sigmas. [measured: docs/link.md]
 LEAN_SHARE = 1.0 / 3.0
 MAX_LEAN_RAD = math.radians(30.0)  # [spec: ArduPilot ANGLE_MAX, default]
 # Where neither covers the interval, as after a gap of the telemetry or a restart of the link, the vehicle may lean as
