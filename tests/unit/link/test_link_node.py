@@ -70,7 +70,7 @@ def test_late_estimates_at_2_hz_give_accurate_gps_input_at_10_hz() -> None:
 
 
 def test_no_position_is_sent_twice() -> None:
-    published = fly(LinkNode(10.0), 0, 10 * S, every(1 * S, estimate))
+    published = fly(LinkNode(10.0), 0, 10 * S, every(S // 2, estimate))
     places = [(g.lat_deg, g.lon_deg) for g in gps(published) if g.fix_type == 3]
     assert len(places) == len(set(places)) > 90
 
@@ -85,8 +85,9 @@ def test_reported_accuracy_grows_with_the_age_of_the_estimate() -> None:
     grown = [g.horiz_accuracy_m for g in gps(published) if g.fix_type == 3]
     assert grown[0] == pytest.approx(4.0)
     assert all(b > a for a, b in pairwise(grown))
-    # 4 m, 0.5 m/s and the 1 m/s^2 of a vehicle without attitude, after 1.4 s: there the speed passes 1.5 m/s
-    assert grown[-1] == pytest.approx(math.sqrt(16 + 0.7**2 + 0.98**2))
+    # 4 m, 0.5 m/s and the 1.9 m/s^2 of a vehicle without attitude, after 0.7 s: there the speed passes 1.5 m/s
+    unmodelled_m = 0.5 * 9.81 * math.tan(math.radians(30.0)) / 3.0 * 0.7**2
+    assert grown[-1] == pytest.approx(math.sqrt(16 + 0.35**2 + unmodelled_m**2))
 
 
 # --- no fix ---

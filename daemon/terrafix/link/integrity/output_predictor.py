@@ -10,23 +10,39 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from terrafix.core.geodesy import rot_from_quat, yaw_of
-from terrafix.core.inertial import GRAVITY_MPS2
-from terrafix.link.integrity.inertial_integrator import BUFFER_NS, InertialIntegrator
+from terrafix.core.inertial import GRAVITY_MPS2, covers
+from terrafix.link.integrity.inertial_integrator import BUFFER_NS, MAX_ATTITUDE_AGE_NS, InertialIntegrator
 from terrafix.messages import Imu, NavEstimate, VehicleState
 
-EE, EN, NN, UU = 0, 1, 7, 14  # indices of the position block in NavEstimate.cov [spec: row-major 6x6 covariance]
+# Indices of the position block in NavEstimate.cov, and of the rotation about up. [spec: row-major 6x6 covariance]
+EE, EN, NN, UU, HEADING = 0, 1, 7, 14, 35
 WGS84_A_M = 6_378_137.0  # m, semi-major axis [spec: NIMA TR8350.2]
 WGS84_E2 = 6.694379990141e-3  # first eccentricity squared [spec: NIMA TR8350.2]
 # 1-sigma of the acceleration that the prediction leaves out, m/s^2, by what is known of the interval.
 # With IMU readings: an attitude error of 2 degrees projects so much gravity into the horizontal. The result was
 # compared with the truth of ArduPilot's firmware. [measured: docs/link.md]
 ACCEL_SIGMA_IMU_MPS2 = 0.4
-HEADING_SIGMA_RAD = math.radians(5.0)  # rad; heading error, rotates the inertial increments [tuned]
-# With attitude alone the turn is known: what is left is gusts and speed changes of a plane. A copter that rolls into a
-# corner accelerates ten times as much, which is why IMU readings are requested. [tuned]
+HEADING_SIGMA_RAD = math.radians(5.0)  # rad; heading error, rotates the inertial increments; at least [tuned]
+# With attitude alone a banked turn is known: what is left is gusts and speed changes of a plane. [tuned]
 ACCEL_SIGMA_ATTITUDE_MPS2 = 0.5
-ACCEL_SIGMA_UNKNOWN_MPS2 = 1.0  # without either: half a standard-rate turn at 20 m/s [tuned]
+# Share of the acceleration of a lean that is 1-sigma where the lean may, or may not, be a manoeuvre: a copter that
+# leans brakes, turns, or holds its speed against drag and wind. All of it is three sigmas. [measured: docs/link.md]
+LEAN_SHARE = 1.0 / 3.0
+MAX_LEAN_RAD = math.radians(30.0)  # [spec: ArduPilot ANGLE_MAX, default]
+# Where neither covers the interval, as after a gap of the telemetry or a restart of the link, the vehicle may lean as
+# far as it can: 1.9 m/s^2
+ACCEL_SIGMA_UNKNOWN_MPS2 = LEAN_SHARE * GRAVITY_MPS2 * math.tan(MAX_LEAN_RAD)
 MIN_YAW_RATE_BASELINE_NS = 50_000_000  # ns; over shorter intervals noise of the yaw dominates its rate [tuned]
+
+
+@dataclass(frozen=True)
+class LateralAcceleration:
+    """``right_mps2``: of the banked turn since an estimate, at the mean heading ``heading_rad``; ``sigma_mps2``:
+    1-sigma of what the turn does not explain."""
+
+    right_mps2: float
+    heading_rad: float
+    sigma_mps2: float
 
 
 @dataclass(frozen=True)
@@ -48,7 +64,7 @@ class InertialBuffer:
     """Attitudes and IMU readings of the last seconds (BUFFER_NS), for the motion from an estimate to the present."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, float, float]] = deque()  # t_ns, yaw [rad], roll [rad]
+        self._samples: deque[tuple[int, float, float, float]] = deque()  # t_ns; yaw, roll, pitch [rad]
         self._integrator = InertialIntegrator()
 
     def add_imu(self, imu: Imu) -> None:
@@ -59,7 +75,7 @@ class InertialBuffer:
         by the heading of ``estimate``; None when readings or attitude are missing."""
         nearest = min(self._samples, key=lambda s: abs(s[0] - estimate.t_ns), default=None)
         increments = self._integrator.delta(estimate.t_ns, now_ns)
-        if increments is None or nearest is None:
+        if increments is None or nearest is None or abs(nearest[0] - estimate.t_ns) > MAX_ATTITUDE_AGE_NS:
             return None
         # The autopilot's heading is its compass; that of the estimate is corrected by map and odometry.
         correction_rad = yaw_of(rot_from_quat(estimate.q_w_b)) - nearest[1]
@@ -67,32 +83,40 @@ class InertialBuffer:
         return tuple((c * e + s * n, c * n - s * e, u) for e, n, u in increments)
 
     def add_attitude(self, state: VehicleState) -> None:
-        if state.yaw_rad is None or state.roll_rad is None:
+        if state.yaw_rad is None or state.roll_rad is None or state.pitch_rad is None:
             return
         self._integrator.add_attitude(state)
         if self._samples and state.t_ns <= self._samples[-1][0]:
             return
-        self._samples.append((state.t_ns, state.yaw_rad, state.roll_rad))
+        self._samples.append((state.t_ns, state.yaw_rad, state.roll_rad, state.pitch_rad))
         while self._samples[-1][0] - self._samples[0][0] > BUFFER_NS:
             self._samples.popleft()
 
-    def lateral_accel(self, since_ns: int, now_ns: int, speed_mps: float) -> tuple[float, float] | None:
-        """-> (acceleration to the right [m/s^2], mean heading [rad]) since ``since_ns``; None: attitude not known.
+    def lateral_accel(self, since_ns: int, now_ns: int, speed_mps: float) -> LateralAcceleration | None:
+        """-> acceleration across the heading since ``since_ns``; None: attitudes do not cover the time since then. A
+        vehicle that rolls out of a corner now may have been in it before.
 
         A coordinated turn shows in two quantities: g tan(roll), and yaw rate times speed. The result is the smaller of
         the two when their signs agree, else zero: a multicopter that yaws on the spot or leans against the wind does
-        not turn its velocity."""
-        window = [s for s in self._samples if s[0] >= since_ns - MIN_YAW_RATE_BASELINE_NS]
-        if not window or now_ns - window[-1][0] > MIN_YAW_RATE_BASELINE_NS * 4:
+        not turn its velocity. What roll and pitch leave unexplained may be a manoeuvre (LEAN_SHARE)."""
+        window = [s for s in self._samples if since_ns - MIN_YAW_RATE_BASELINE_NS <= s[0] <= now_ns]
+        if not covers([s[0] for s in window], since_ns, now_ns, MAX_ATTITUDE_AGE_NS):
             return None
-        (t0, yaw0, _), (t1, yaw1, _) = window[0], window[-1]
-        if t1 - t0 < MIN_YAW_RATE_BASELINE_NS:
-            return 0.0, yaw1
+        (t0, yaw0, *_), (t1, yaw1, *_) = window[0], window[-1]
         yaw_change_rad = math.remainder(yaw1 - yaw0, math.tau)
-        by_yaw = yaw_change_rad / ((t1 - t0) * 1e-9) * speed_mps
-        by_roll = GRAVITY_MPS2 * math.tan(max(-1.2, min(1.2, sum(s[2] for s in window) / len(window))))
+        leans = [(_by_lean(roll), _by_lean(pitch)) for _, _, roll, pitch in window]
+        by_roll = sum(right for right, _ in leans) / len(leans)
+        # Over a shorter baseline the noise of the yaw would be its rate.
+        by_yaw = yaw_change_rad / ((t1 - t0) * 1e-9) * speed_mps if t1 - t0 >= MIN_YAW_RATE_BASELINE_NS else 0.0
         accel = math.copysign(min(abs(by_yaw), abs(by_roll)), by_roll) if by_yaw * by_roll > 0 else 0.0
-        return accel, yaw0 + yaw_change_rad / 2
+        left_mps2 = math.sqrt(sum((right - accel) ** 2 + ahead**2 for right, ahead in leans) / len(leans))
+        sigma = math.hypot(ACCEL_SIGMA_ATTITUDE_MPS2, LEAN_SHARE * left_mps2)
+        return LateralAcceleration(accel, yaw0 + yaw_change_rad / 2, sigma)
+
+
+def _by_lean(angle_rad: float) -> float:
+    """Horizontal acceleration [m/s^2] of a vehicle that holds its height at this roll or pitch."""
+    return GRAVITY_MPS2 * math.tan(max(-1.2, min(1.2, angle_rad)))
 
 
 def predict_to(estimate: NavEstimate, now_ns: int, inertial: InertialBuffer) -> PredictedState:
@@ -104,11 +128,12 @@ def predict_to(estimate: NavEstimate, now_ns: int, inertial: InertialBuffer) -> 
     if increments is not None:
         delta_v, delta_p = increments
         accel_sigma = ACCEL_SIGMA_IMU_MPS2
-        heading_error_mps, heading_error_m = (HEADING_SIGMA_RAD * math.hypot(v[0], v[1]) for v in increments)
+        heading_sigma_rad = max(HEADING_SIGMA_RAD, math.sqrt(max(0.0, estimate.cov[HEADING])))
+        heading_error_mps, heading_error_m = (heading_sigma_rad * math.hypot(v[0], v[1]) for v in increments)
     else:
         turn = inertial.lateral_accel(estimate.t_ns, now_ns, math.hypot(ve, vn))
-        accel_sigma = ACCEL_SIGMA_UNKNOWN_MPS2 if turn is None else ACCEL_SIGMA_ATTITUDE_MPS2
-        right, heading = turn if turn is not None else (0.0, 0.0)
+        turn = turn or LateralAcceleration(0.0, 0.0, ACCEL_SIGMA_UNKNOWN_MPS2)
+        right, heading, accel_sigma = turn.right_mps2, turn.heading_rad, turn.sigma_mps2
         ae, an = right * math.cos(heading), -right * math.sin(heading)  # right of the heading, in east and north
         delta_v, delta_p = (ae * age_s, an * age_s, 0.0), (0.5 * ae * age_s**2, 0.5 * an * age_s**2, 0.0)
     lat_deg, lon_deg = offset(estimate.lat_deg, estimate.lon_deg, ve * age_s + delta_p[0], vn * age_s + delta_p[1])

@@ -1,6 +1,7 @@
 """Prediction with inertial readings: a copter that rolls into a corner is followed, constant velocity is not used."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,7 +9,15 @@ import pytest
 from link_rig import covariance
 from terrafix import messages as m
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
-from terrafix.link.integrity.output_predictor import InertialBuffer, PredictedState, distance_m, offset, predict_to
+from terrafix.link.integrity.output_predictor import (
+    ACCEL_SIGMA_ATTITUDE_MPS2,
+    ACCEL_SIGMA_UNKNOWN_MPS2,
+    InertialBuffer,
+    PredictedState,
+    distance_m,
+    offset,
+    predict_to,
+)
 
 MS, S = 1_000_000, 1_000_000_000
 LAT, LON, AMSL = 48.1, 14.3, 400.0
@@ -36,12 +45,19 @@ def true_motion(t_s: float) -> tuple[np.ndarray, np.ndarray]:
     return v, p
 
 
-def recorded(until_s: float, *, compass_rad: float = 0.0, lost_s: tuple[float, float] = (9.0, 9.0)) -> InertialBuffer:
-    """ATTITUDE at 25 Hz, readings at 33 Hz, from 0.2 s before the corner; none in the span ``lost_s``."""
+def recorded(
+    until_s: float,
+    *,
+    compass_rad: float = 0.0,
+    lost_s: tuple[float, float] = (9.0, 9.0),
+    attitude_lost_s: tuple[float, float] = (9.0, 9.0),
+) -> InertialBuffer:
+    """ATTITUDE at 25 Hz, readings at 33 Hz, from 0.2 s before the corner; no readings in the span ``lost_s``, no
+    attitudes in ``attitude_lost_s``."""
     inertial = InertialBuffer()
-    moments = [(t, "attitude") for t in np.arange(-0.2, until_s, 0.04)] + [
-        (t, "imu") for t in np.arange(-0.19, until_s, 0.03) if not lost_s[0] < t < lost_s[1]
-    ]
+    moments = [
+        (t, "attitude") for t in np.arange(-0.2, until_s, 0.04) if not attitude_lost_s[0] < t < attitude_lost_s[1]
+    ] + [(t, "imu") for t in np.arange(-0.19, until_s, 0.03) if not lost_s[0] < t < lost_s[1]]
     for t_s, kind in sorted(moments):
         pitch, roll = attitude(max(t_s, 0.0))
         t_ns = round(t_s * S) + S
@@ -59,7 +75,9 @@ def recorded(until_s: float, *, compass_rad: float = 0.0, lost_s: tuple[float, f
     return inertial
 
 
-def predicted(age_s: float, inertial: InertialBuffer) -> PredictedState:
+def predicted(age_s: float, inertial: InertialBuffer, *, heading_sigma_rad: float = 0.01) -> PredictedState:
+    cov = list(covariance(3.0))
+    cov[35] = heading_sigma_rad**2
     estimate = m.NavEstimate(
         t_ns=S,
         frame_id=1,
@@ -70,7 +88,7 @@ def predicted(age_s: float, inertial: InertialBuffer) -> PredictedState:
         velocity_enu_mps=(SPEED_MPS, 0.0, 0.0),
         velocity_sigma_mps=0.2,
         q_w_b=quat_from_rot(rot_w_b(YAW_RAD, *attitude(0.0))),
-        cov=covariance(3.0),
+        cov=tuple(cov),
         source_label=m.SourceLabel.SATELLITE_ANCHORED,
         covariance_mode=m.CovarianceMode.MARGINALS,
         last_anchor_age_ms=0,
@@ -112,3 +130,64 @@ def test_readings_that_do_not_cover_the_interval_are_not_used(lost_s: tuple[floa
 def test_the_sigma_of_inertial_prediction_grows_with_age_and_acceleration() -> None:
     sigmas = [predicted(age_s, recorded(age_s)).speed_sigma_mps for age_s in (0.0, 0.3, 0.8, 1.6)]
     assert sigmas == sorted(sigmas) and sigmas[0] == pytest.approx(0.2)
+
+
+def error_in_sigmas(state: PredictedState, age_s: float) -> tuple[float, float]:
+    """Error of position and of velocity over what the prediction adds to the claim of the estimate, which is 3 m and
+    0.2 m/s: the estimate itself is exact here."""
+    velocity, displacement = true_motion(age_s)
+    lat, lon = offset(LAT, LON, float(displacement[0]), float(displacement[1]))
+    added_m = math.sqrt(state.horizontal_sigma_m**2 - 3.0**2)
+    added_mps = math.sqrt(state.speed_sigma_mps**2 - 0.2**2)
+    error_mps = float(np.linalg.norm(np.array(state.velocity_enu_mps[:2]) - velocity[:2]))
+    return distance_m(state.lat_deg, state.lon_deg, lat, lon) / added_m, error_mps / added_mps
+
+
+@pytest.mark.parametrize("age_s", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize(
+    "until",
+    [
+        pytest.param(lambda age_s: age_s - 0.05, id="the link has one attitude: it was restarted"),
+        pytest.param(lambda age_s: age_s - 0.25, id="the link has attitudes of the last 0.25 s"),
+        pytest.param(lambda age_s: 9.0, id="no telemetry since before the corner"),
+    ],
+)
+def test_a_corner_that_the_telemetry_does_not_cover_is_in_the_claim(
+    age_s: float, until: Callable[[float], float]
+) -> None:
+    """Of a position that was 7 of its sigmas off: a link that had just been restarted took its first attitude, with no
+    yaw rate yet, for the proof that the vehicle had flown straight since an estimate that was 2 s old."""
+    gap = (-1.0, until(age_s))
+    state = predicted(age_s, recorded(age_s, lost_s=gap, attitude_lost_s=gap))
+    assert max(error_in_sigmas(state, age_s)) < 3.0
+
+
+def test_a_gap_of_the_attitudes_within_the_interval_is_in_the_claim() -> None:
+    whole = predicted(1.0, recorded(1.0, lost_s=(-1.0, 9.0)))
+    gap = predicted(1.0, recorded(1.0, lost_s=(-1.0, 9.0), attitude_lost_s=(0.3, 0.7)))
+    assert gap.speed_sigma_mps == pytest.approx(math.hypot(0.2, ACCEL_SIGMA_UNKNOWN_MPS2))
+    assert whole.speed_sigma_mps < gap.speed_sigma_mps
+
+
+@pytest.mark.parametrize("age_s", [0.3, 0.65, 1.5])
+def test_a_corner_that_attitudes_alone_show_is_in_the_claim(age_s: float) -> None:
+    """A lean to the side and to the rear without a turn of the heading: brakes, or leans against the wind."""
+    state = predicted(age_s, recorded(age_s, lost_s=(-1.0, 9.0)))
+    assert max(error_in_sigmas(state, age_s)) < 3.5
+
+
+def test_level_flight_with_attitudes_alone_claims_gusts_only() -> None:
+    inertial = InertialBuffer()
+    for t_ns in range(S - 200 * MS, 2 * S, 40 * MS):
+        inertial.add_attitude(m.VehicleState(t_ns=t_ns, source="mavlink", yaw_rad=YAW_RAD, pitch_rad=0.0, roll_rad=0.0))
+    assert predicted(1.0, inertial).speed_sigma_mps == pytest.approx(math.hypot(0.2, ACCEL_SIGMA_ATTITUDE_MPS2))
+
+
+def test_a_heading_that_is_hardly_known_turns_the_inertial_increments() -> None:
+    """The readings are rotated by the heading of the estimate, so its uncertainty is that of their direction."""
+    velocity, _ = true_motion(1.0)
+    increment_mps = float(np.linalg.norm((velocity - np.array([SPEED_MPS, 0.0, 0.0]))[:2]))
+    usual = predicted(1.0, recorded(1.0), heading_sigma_rad=math.radians(1.0))
+    unknown = predicted(1.0, recorded(1.0), heading_sigma_rad=0.5)
+    assert usual.speed_sigma_mps == pytest.approx(math.hypot(0.2, 0.4, math.radians(5.0) * increment_mps), rel=0.02)
+    assert unknown.speed_sigma_mps == pytest.approx(math.hypot(0.2, 0.4, 0.5 * increment_mps), rel=0.02)
