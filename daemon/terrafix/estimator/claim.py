@@ -27,7 +27,7 @@ def claim(estimator: Estimator, frame: FrameState, time_offset_sigma_s: float, c
     """Claim of ``frame``, the newest one. ``time_offset_sigma_s``: 1-sigma of the camera against telemetry;
     ``calibration_sigma_m``: 1-sigma of the position by a description that monitors have found wrong."""
     state = estimator.state
-    budget = _Budget(tangent_to_world(frame.cov, frame.pose.rotation().matrix()))
+    budget = _Budget(state.covariances.widening**2 * tangent_to_world(frame.cov, frame.pose.rotation().matrix()))
     cov = budget.cov
     # The error of the map is the same everywhere: no number of matches averages it away.
     cov[WORLD_POSITION, WORLD_POSITION] += estimator.map_sigma_m**2 * np.eye(3)

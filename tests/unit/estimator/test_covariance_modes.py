@@ -9,6 +9,7 @@ from simulated_flight import KEYFRAME_EVERY, EstimatorRun, Flight, blind, cov_of
 from smoother_marginals import JOINT, MARGINAL, recorded_marginals
 from terrafix.core.limits import WINDOW_NODES
 from terrafix.core.pose import log_so3
+from terrafix.estimator.claim import claim
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
 from terrafix.estimator.graph.pose_graph import rebuild_prior
@@ -242,6 +243,28 @@ def test_the_first_frame_after_cooling_has_the_marginal_again() -> None:
         assert run.estimate(i).covariance_mode is CovarianceMode.MARGINALS
         assert np.array_equal(last.cov, estimator.graph.covariance(last.node))
         assert np.array_equal(last.velocity_cov, estimator.graph.velocity_covariance(last.node)[:3, :3])
+
+
+def test_where_marginals_return_the_claim_does_not_step_and_narrows_by_a_twentieth_a_frame() -> None:
+    """The propagated covariance is made three times as wide, which makes its sigma 1.7 times as large as that of the
+    marginals: it was in flights."""
+    flight = Flight(END, seed=2)
+    run = hot_run(flight, COOL_FROM)
+    estimator, last = newest(run)
+    covariances = estimator.state.covariances
+    assert covariances._propagated is not None
+    covariances._propagated.begin(last.node, 3.0 * estimator.graph.joint_covariance(last.node))
+    hot = claim(estimator, estimator.state.frame_state(last.frame_id, last.t_s, last.node), 0.0, 0.0)
+    covariances.set_mode(CovarianceMode.MARGINALS)
+    cool = claim(estimator, estimator.state.frame_state(last.frame_id, last.t_s, last.node), 0.0, 0.0)
+    assert covariances.widening == pytest.approx(3.0**0.5)
+    assert cool.terms_m2["graph"] == pytest.approx(hot.terms_m2["graph"])
+    run.feed([health(ThermalBand.NORMAL)])
+    run.fly(flight, COOL_FROM, COOL_FROM + 1)
+    assert covariances.widening == pytest.approx(0.95 * 3.0**0.5)
+    covariances.widening = 1.02
+    run.fly(flight, COOL_FROM + 1, COOL_FROM + 2)
+    assert covariances.widening == 1.0
 
 
 def _without_a_solution(run: EstimatorRun, flight: Flight, i: int, monkeypatch: pytest.MonkeyPatch) -> None:
