@@ -18,8 +18,8 @@ HEAPS = 1
 EXCESS_BYTES = 64 * 1024 * 1024
 
 # What was touched once stays with the process, although most of it is free most of the time: of vision's 134 MB 30 to
-# 60 are in use. So free memory goes back once a minute; the next frames take their part of it again: 5 ms for 67 MB, and
-# 35 ms of page faults in the next frame that needs as much. [measured: docs/decisions/048]
+# 60 are in use. So free memory goes back once a minute: 5 ms for 67 MB, and 35 ms of page faults in the next frame that
+# needs as much. [measured: docs/decisions/048]
 RETURN_S = 60.0
 LEAST_BYTES = 8 * 1024 * 1024  # less is not worth the system call [measured: docs/decisions/048]
 
