@@ -114,6 +114,15 @@ def test_a_stopped_process_does_not_wait_for_a_processor() -> None:
         os.waitid(os.P_PID, process.pid, os.WSTOPPED)
         before_ns = managed_process.waited_for_processor_ns(process.pid)
         time.sleep(0.1)
-        assert managed_process.waited_for_processor_ns(process.pid) == before_ns > 0
+        after_ns = managed_process.waited_for_processor_ns(process.pid)
         process.kill()
+    assert after_ns == before_ns
     assert managed_process.waited_for_processor_ns(process.pid) == 0, "it has ended"
+
+
+def test_the_wait_for_a_processor_is_the_run_delay_of_the_kernel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "schedstat").write_text("4711 815 3\n")
+    monkeypatch.setattr(managed_process, "Path", lambda _path: tmp_path / "schedstat")
+    assert managed_process.waited_for_processor_ns(1) == 815
