@@ -56,6 +56,7 @@ class SegmentRing:
         # Written at the start of every segment, so that each segment can be evaluated when earlier ones are deleted.
         self._origin: Message | None = None
         self._lost: Counter[str] = Counter()
+        self._unflushed: Counter[str] = Counter()  # lost with the chunk that they are in, if the disk does not take it
         self._blocked = ""  # reason why nothing is written
         self._sync: threading.Thread | None = None  # the last synchronisation with the disk
         self._sync_error: OSError | None = None  # of the present file
@@ -79,9 +80,9 @@ class SegmentRing:
             self._lost[type(message).__name__] += 1
             return
         try:
+            self._unflushed[type(message).__name__] += 1
             self._writer.write(message, received_ns)
         except OSError as error:
-            self._lost[type(message).__name__] += 1
             self._block(error.strerror or str(error))
             return
         if self._writer.size_bytes() > self._segment_bytes or received_ns - self._opened_ns > SEGMENT_NS:
@@ -102,13 +103,14 @@ class SegmentRing:
             self._lost[name] += 1
             return
         try:
+            self._unflushed[name] += 1
             write(self._writer)
         except OSError as error:
-            self._lost[name] += 1
             self._block(error.strerror or str(error))
 
     def take_lost(self) -> Counter[str]:
-        """-> number of messages by type that were not written since the last call, once they can be recorded."""
+        """-> number of messages by type that were not written since the last call, once they can be recorded. Of the
+        time since the last flush before a disk failed all are counted, although some may be in the file."""
         if self._writer is None:
             return Counter()
         lost, self._lost = self._lost, Counter()
@@ -122,6 +124,7 @@ class SegmentRing:
             if self._sync_error is not None:
                 raise self._sync_error
             self._writer.flush()
+            self._unflushed.clear()
             if self._clock_s() - self._synced_s >= FSYNC_S:
                 self._begin_sync(self._writer)
             if self._below_floor():
@@ -154,6 +157,8 @@ class SegmentRing:
 
     def _block(self, reason: str) -> None:
         """Ends the present segment. The flight goes on without a record until the disk takes one again."""
+        self._lost += self._unflushed
+        self._unflushed.clear()
         self._close_writer()
         self._tried_s = self._clock_s()
         if not self._blocked:
@@ -163,11 +168,16 @@ class SegmentRing:
         self._blocked = reason
 
     def _close_writer(self) -> None:
+        """What the disk does not take at the end of a file is counted as lost."""
         writer, self._writer = self._writer, None
         self._sync_error = None
-        if writer is not None:
-            with suppress(OSError):
-                writer.close()
+        if writer is None:
+            return
+        try:
+            writer.close()
+        except OSError:
+            self._lost += self._unflushed
+        self._unflushed.clear()
 
     def _next(self, received_ns: int) -> None:
         self._close_writer()

@@ -2,6 +2,7 @@
 
 import random
 import socket
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -14,9 +15,11 @@ from typing import Any
 import pytest
 
 from console_rig import BOUNDARY, CAMERA, NEW, Answer, Console, batch, jpeg, multipart, settings
+from small_disk import small_disk
 from terrafix_tools.console import uploads
 from terrafix_tools.console.openapi import schema
 from terrafix_tools.console.settings import Limits
+from terrafix_tools.console.store.database import FILE
 
 
 @pytest.fixture(scope="module")
@@ -251,6 +254,27 @@ def test_a_full_disk_refuses_uploads_and_leaves_the_flight_as_it_was(tmp_path: P
         flight_id = console.create()
         assert_refused(console.upload(flight_id, batch(1)), 507, "free")
         assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 0
+
+
+def test_a_disk_that_fills_amid_an_upload_costs_that_upload_and_nothing_else(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 40) as disk:
+        with Console(settings(disk.folder, limits=Limits(disk_reserve_bytes=0))) as console:
+            flight_id = console.create()
+            assert console.upload(flight_id, batch(1)).status == 202
+            for free_bytes in (0, 4096, 8192, 40960, 81920):
+                disk.fill(free_bytes)
+                assert_refused(console.upload(flight_id, batch(11)), 507)
+                assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 10
+                disk.free()
+            disk.fill()
+            assert_refused(console.send("POST", "/flights", NEW), 507)
+            disk.free()
+            assert console.upload(flight_id, batch(11)).status == 202
+            assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 20
+            stored = sorted((disk.folder / "flights" / flight_id / "images").iterdir())
+            assert [path.read_bytes() for path in stored] == [content for _, _, content in (*batch(1), *batch(11))]
+        with sqlite3.connect(disk.folder / FILE) as database:
+            assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
 
 
 def test_an_upload_that_is_too_slow_makes_room_for_others(tmp_path: Path) -> None:
