@@ -81,3 +81,12 @@ def test_the_slope_is_that_of_the_line_with_its_uncertainty() -> None:
 )
 def test_growth_is_judged_by_all_processes_together_and_by_open_files(given: Samples, expected: list[str]) -> None:
     assert grows(growth(given)) == expected
+
+
+def test_caches_that_fill_in_the_first_half_are_no_growth_and_what_grows_in_the_second_is() -> None:
+    filling, late = samples(0.0), samples(0.0)
+    t_s = np.array(filling.t_s)
+    filling.memory_mb["vision"] = (np.array(filling.memory_mb["vision"]) + np.minimum(t_s / 60.0, 59.0)).tolist()
+    late.memory_mb["vision"] = (np.array(late.memory_mb["vision"]) + np.maximum(t_s - 3600.0, 0.0) / 900.0).tolist()
+    assert grows(growth(filling)) == []
+    assert grows(growth(late)) == ["memory by 2.5 % an hour"]
