@@ -176,11 +176,11 @@ def test_a_disk_that_fails_in_flight_ends_the_segment_and_raises_nothing(
     assert len(list(tmp_path.glob("*.mcap"))) == 2
 
 
-<<<<<<< HEAD
 def end_of_sync(ring: SegmentRing) -> None:
     if ring._sync is not None:
         ring._sync.join(5.0)
-=======
+
+
 class _Room:
     """Bytes that files on a disk still take."""
 
@@ -262,7 +262,6 @@ def test_a_record_goes_on_in_a_new_file_when_a_real_disk_was_full_for_a_time(tmp
         ring.close()
         kept = frames_of(folder)
         assert {*range(40), *range(80, 120)} <= set(kept) and len(kept) < 90
->>>>>>> c871e90 (A disk that fills amid a write: what the failed chunk of the record had is counted as lost; tests on a small disk for the record and the console)
 
 
 def test_a_folder_that_vanished_is_made_again(tmp_path: Path, clock: Clock) -> None:
