@@ -1,6 +1,8 @@
 """The command line `terrafix`. Each command imports its modules when it is called, so that --help is fast."""
 
 import contextlib
+import errno
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafix import __version__
-from terrafix.core.errors import TerrafixError, UsageError
+from terrafix.core.errors import OutputError, TerrafixError, UsageError
 from terrafix_tools.accept.cli import accept
 from terrafix_tools.chaos.cli import chaos
 from terrafix_tools.compare.cli import compare
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
 
 # optional packages of the extra `ground`; not installed on a vehicle
 GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog")
+# a full disk, or one over its quota
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 # and of the extra `console`
 CONSOLE_PACKAGES = ("fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "python_multipart", "pydantic")
 
@@ -257,6 +261,11 @@ def bench(
     run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat, growing=growing, page=page)
 
 
+def _printable(text: str) -> str:
+    """One line in any encoding: names of files may hold line breaks, and bytes that are no UTF-8."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 def main(fork_server: "ForkServer | None" = None) -> None:
     """Runs the command line. A TerrafixError ends with one line and its exit code, any other exception is a traceback.
 
@@ -265,8 +274,16 @@ def main(fork_server: "ForkServer | None" = None) -> None:
     try:
         app(obj=fork_server)
     except TerrafixError as error:
-        typer.echo(f"terrafix: {error}", err=True)
+        typer.echo(f"terrafix: {_printable(str(error))}", err=True)
         sys.exit(error.exit_code)
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what it still holds is not written at the exit
+        typer.echo(
+            f"terrafix: output cannot be written ({error.strerror}); free some space, or write elsewhere", err=True
+        )
+        sys.exit(OutputError.exit_code)
     except ModuleNotFoundError as error:
         missing = (error.name or "").split(".")[0]
         extra = "ground" if missing in GROUND_PACKAGES else "console" if missing in CONSOLE_PACKAGES else ""
