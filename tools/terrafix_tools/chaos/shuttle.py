@@ -97,9 +97,7 @@ def closed(states: list[State], ground_amsl_m: Heights) -> list[State]:
     first, last, count = states[0], states[-1], len(states) - 1
     lap_s = count * STEP_S
     gap_m = last.p_b_in_w_m - first.p_b_in_w_m
-    yaw, pitch, roll = (
-        math.remainder(b - a, math.tau) for a, b in zip(_angles(first), _angles(last), strict=True)
-    )
+    yaw, pitch, roll = (math.remainder(b - a, math.tau) for a, b in zip(_angles(first), _angles(last), strict=True))
     places_m = np.array([s.p_b_in_w_m - k / count * gap_m for k, s in enumerate(states[:-1])])
     ground_m = ground_amsl_m(places_m[None, :, 0], places_m[None, :, 1])[0]
     return [
