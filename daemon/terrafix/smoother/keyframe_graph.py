@@ -154,9 +154,15 @@ class KeyframeGraph:
         return Join(first, second, between, cov, join.scale_sigma)
 
     def pieces(self) -> Iterator[list[int]]:
-        """Keyframes of each tree, ascending; a tree of one frame only where it has an anchor."""
+        """Keyframes of each tree, ascending; a tree of one frame only where it has an anchor or a join."""
+        joined = {
+            frame_id
+            for join in self.joins
+            for frame_id in (join.first, join.second)
+            if frame_id in self.frames and self.frames[frame_id].parent is None
+        }
         of_root: dict[int, list[int]] = {}
-        for keyframe in sorted({*self._children, *self.anchors}):
+        for keyframe in sorted({*self._children, *self.anchors, *joined}):
             of_root.setdefault(self.root(keyframe), []).append(keyframe)
         yield from of_root.values()
 

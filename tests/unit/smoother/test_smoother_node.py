@@ -67,6 +67,15 @@ def test_the_start_of_a_fragment_that_was_kilometres_off_does_not_hold_it_back()
     assert max(track.error_m(i) for i in range(29)) < 3.0
 
 
+def test_a_relocalisation_places_a_fragment_that_has_only_one_frame_yet() -> None:
+    track = Track()
+    track.fly(0, 20, 0)
+    track.feed([track.anchor(5), track.anchor(15)])
+    track.feed([track.prediction(25, (25.0, -20.0), 1), track.link(25, 10, 1, relocalization=True)])
+    track.feed([track.prediction(27, fragment_id=2)])
+    assert track.refined[25].fragment_id == 1 and track.error_m(25) < 3.0
+
+
 def test_a_wrong_map_match_is_rejected_when_others_contradict_it() -> None:
     track = Track()
     track.fly(0, 40)

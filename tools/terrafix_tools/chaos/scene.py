@@ -1,5 +1,6 @@
 """The flight of the fault matrix: a copter over a generated place, from take-off to landing, with its phases."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -18,6 +19,7 @@ from terrafix_tools.sim.world import place as world
 
 AGL_M = 100.0
 LEG_M = 250.0  # of the two legs, east and then north
+WAY = ((LEG_M, 0.0), (LEG_M, LEG_M))
 STEP_S = 0.1  # of the course
 CRUISE_SHARE = 0.95  # of the greatest height
 STRAIGHT_RADPS = 0.05  # a turn is faster
@@ -60,7 +62,7 @@ def scene_in(folder: Path, seed: int) -> Scene:
     """The flight in ``folder``, which is generated if it is not there. Raises OutputError, SourceError."""
     if not (folder / COURSE).exists():
         mission = folder.with_suffix(".waypoints")
-        write_mission(mission, _mission(seed))
+        write_mission(mission, mission_along("two legs", seed, WAY))
         flight = make(folder, FlightOptions(seed=seed, vehicle=Kind.COPTER, mission=mission), progress=False)
         course_of(flight, folder)
     course = read_course(folder / COURSE)
@@ -77,18 +79,18 @@ def course_of(flight: Flight, folder: Path) -> Course:
     return read_course(folder / COURSE)
 
 
-def _mission(seed: int) -> Mission:
-    """Take-off in the middle of the place, two legs at AGL_M above the take-off, landing at their end."""
+def mission_along(name: str, seed: int, way_m: Sequence[tuple[float, float]]) -> Mission:
+    """Take-off in the middle of the place of ``seed``, legs at AGL_M above it along ``way_m`` (east and north of it),
+    landing at their end."""
     place = world.generate(seed)
     x, y = place.layout.width_m / 2, place.layout.height_m / 2
-    home, corner, end = (place.wgs84(x + dx, y + dy) for dx, dy in ((0.0, 0.0), (LEG_M, 0.0), (LEG_M, -LEG_M)))
+    corners = [place.wgs84(x + east_m, y - north_m) for east_m, north_m in way_m]
     items = (
         Item(Do.TAKE_OFF, height_m=AGL_M),
-        Item(Do.WAYPOINT, 1, *corner, height_m=AGL_M),
-        Item(Do.WAYPOINT, 2, *end, height_m=AGL_M),
-        Item(Do.LAND, 3, *end, height_m=0.0),
+        *(Item(Do.WAYPOINT, i + 1, *corner, height_m=AGL_M) for i, corner in enumerate(corners)),
+        Item(Do.LAND, len(corners) + 1, *corners[-1], height_m=0.0),
     )
-    return Mission("two legs", *home, items)
+    return Mission(name, *place.wgs84(x, y), items)
 
 
 def _states(flight: Flight) -> list[tuple[float, PeerState]]:
