@@ -159,8 +159,9 @@ def test_the_page_asks_for_the_token_and_offers_a_viewer_nothing_to_do(tmp_path:
         window.wait("document.getElementById('token')")
 
 
-def asking_flight(console: Console) -> tuple[str, list[Gps]]:
-    """A flight with ten images that asks where frame 4 was taken, and its candidates."""
+def asking_flight(console: Console, *, with_places: bool = True) -> tuple[str, list[Gps], UserInputNeeded]:
+    """A flight with ten images that asks where frame 4 was taken, its candidates, and the event that has them, which is
+    already there ``with_places``."""
     flight_id = console.create(name="lost")
     assert console.upload(flight_id, batch(0)).status == 202
     west, south, east, north = console.send("GET", "/maps").json["maps"][0]["bounds"]
@@ -169,18 +170,26 @@ def asking_flight(console: Console) -> tuple[str, list[Gps]]:
     image = f"/flights/{flight_id}/frames/4/image"
     needed = UserInputNeeded(request_id="r1", frame_id=4, image_url=image, candidate_tiles=tiles)
     with console.service.database.write() as db:
-        flights.add_events(db, flight_id, "test", [needed])
+        if with_places:
+            flights.add_events(db, flight_id, "test", [needed])
         asked = InputRequest(request_id="r1", frame_id=4).model_dump_json()
         flights.update(db, flight_id, state="blocked", request=asked)
-    return flight_id, places
+    return flight_id, places, needed
 
 
 def test_a_pixel_and_a_place_on_the_map_answer_a_flight_that_asks(tmp_path: Path, window: Browser) -> None:
     with Console(settings(tmp_path)) as console:
-        flight_id, places = asking_flight(console)
+        flight_id, places, needed = asking_flight(console, with_places=False)
         window.open(f"{console.url}/page/#/flight/{flight_id}")
         window.wait("document.querySelector('.ask-banner button')")
         window.click(".ask-banner button")
+        window.wait("document.querySelector('.ask .soft')")
+        with console.service.database.write() as db:  # the places come after the request, while its view is open
+            flights.add_events(db, flight_id, "test", [needed])
+        hint = {"lat": places[0].lat, "lon": places[0].lon}
+        assert (
+            console.send("POST", f"/flights/{flight_id}/hint", hint).status == 202
+        )  # and the stream reads what is new
         window.wait("document.querySelectorAll('.ask .place').length === 5")
         window.wait("document.querySelector('.ask .frame img').naturalWidth === 640")
         assert window.run("document.querySelector('.ask-send .primary').disabled")
@@ -191,7 +200,7 @@ def test_a_pixel_and_a_place_on_the_map_answer_a_flight_that_asks(tmp_path: Path
         window.click(".ask-send .primary")
         window.wait("!document.querySelector('dialog.ask')")
         with console.service.database.write() as db:
-            ((_, fix),) = flights.hints_before(db, flight_id, 1000)
+            _, (_, fix) = flights.hints_before(db, flight_id, 1000)
         assert isinstance(fix, UserFix) and fix.frame_id == 4
         assert fix.pixel.u == pytest.approx(159.5, abs=2.0) and fix.pixel.v == pytest.approx(239.5, abs=2.0)
         assert distance_of(fix, places[2]) < 1.0
@@ -206,7 +215,7 @@ def distance_of(fix: UserFix, place: Gps) -> float:
 def test_a_lost_connection_is_shown_and_the_stream_goes_on_where_it_was(tmp_path: Path, window: Browser) -> None:
     chosen = settings(tmp_path)
     with Console(chosen) as console:
-        flight_id, _ = asking_flight(console)
+        flight_id, *_ = asking_flight(console)
         port = int(console.url.rpartition(":")[2])
         window.open(f"{console.url}/page/#/flight/{flight_id}")
         window.wait("document.querySelector('.badge.link.live')")

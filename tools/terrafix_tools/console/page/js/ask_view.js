@@ -13,7 +13,7 @@ const HINT_M = 500; // default radius of a hint
 
 export class AskView {
   constructor(flight, request, info) {
-    Object.assign(this, {flight, request, info, pixel: null, place: null});
+    Object.assign(this, {flight, request, info, pixel: null, place: null, small: []});
     this.frame = new FrameView((at) => { this.pixel = at; this.update(); });
     this.mapBox = h("div", {class: "ask-map", "aria-label": t("map")});
     this.line = h("p", {class: "ask-line", role: "status"});
@@ -48,11 +48,19 @@ export class AskView {
     L.control.scale({imperial: false}).addTo(this.map);
     this.map.on("click", ({latlng}) => this.at(latlng));
     this.mapBox.append(h("div", {class: "map-cross", "aria-hidden": "true"}));
-    for (const place of places) L.rectangle(square(place.gps, place.half_size_m), {color: "#fff", weight: 2, dashArray: "5 5", fill: false, interactive: false}).addTo(this.map);
-    this.small = places.map((place, i) => this.thumbnail(place, i));
-    if (!places.length) fill(this.tiles, h("li", {class: "soft"}, t("no_places")));
+    this.showPlaces(places);
     this.update();
     this.frame.element.focus();
+  }
+
+  /** The best places, which may come after the request itself. */
+  showPlaces(places) {
+    this.squares?.remove();
+    const look = {color: "#fff", weight: 2, dashArray: "5 5", fill: false, interactive: false};
+    this.squares = L.layerGroup(places.map((place) => L.rectangle(square(place.gps, place.half_size_m), look))).addTo(this.map);
+    for (const {map} of this.small) map.remove();
+    fill(this.tiles, places.length ? null : h("li", {class: "soft"}, t("no_places")));
+    this.small = places.map((place, i) => this.thumbnail(place, i));
   }
 
   /** One of the best places, as a small map that can be chosen. */

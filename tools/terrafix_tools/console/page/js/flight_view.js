@@ -276,6 +276,7 @@ export class FlightView {
     if (!request) return void this.mapView.showCandidates([]);
     fill(this.asking, h("span", {}, t("ask_banner", number(request.frame_id))), mayAct() ? h("button", {class: "primary", onclick: () => this.help()}, t("help")) : null);
     this.mapView.showCandidates(request.candidate_tiles);
+    if (this.ask?.request.request_id === request.request_id) this.ask.showPlaces(request.candidate_tiles);
   }
 
   drawFrame() {
