@@ -22,8 +22,8 @@ NARROWING = 0.05
 
 
 class Covariances:
-    """Of the nodes of ``graph``. It is told of every change of the graph, after it. ``widening``: at least 1, factor on
-    the sigma of the newest node for its claim, after marginals have returned."""
+    """Of the nodes of ``graph``. Its owner reports every change of the graph, after it. ``widening``: at least 1,
+    factor on the sigma of the newest node for its claim, after marginals have returned."""
 
     def __init__(self, graph: PoseGraph) -> None:
         self._graph = graph

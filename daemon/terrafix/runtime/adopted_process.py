@@ -11,14 +11,14 @@ from pathlib import Path
 
 from terrafix.core import logs
 from terrafix.core.clock import now_ns
-from terrafix.runtime.fork_server import EXIT_UNKNOWN, ForkedProcess, set_parent_death_signal
+from terrafix.runtime.fork_server import EXIT_UNKNOWN, ForkedProcess, set_parent_death_signal, stat_fields
 from terrafix.runtime.run_dir import RunDir, write_atomic
 
 # A process that has no supervisor for so long ends. [spec: WatchdogSec of the unit; a supervisor is there again 1 s
 # after its death, and 10 s after it on a computer with ten times the load]
 WITHOUT_SUPERVISOR_NS = 10_000_000_000
 CHECK_PERIOD_NS = 500_000_000  # [spec: a twentieth of the limit]
-START_TIME_FIELD = 19  # of /proc/PID/stat after the name, proc(5): in clock ticks since the boot
+START_TIME_FIELD = 19  # of ``stat_fields``: in clock ticks since the boot
 
 
 class AdoptedProcess(ForkedProcess):
@@ -102,6 +102,6 @@ class AloneForTooLong:
 def _start_time(pid: int) -> int | None:
     """None: there is no such process."""
     try:
-        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[START_TIME_FIELD])
+        return int(stat_fields(pid)[START_TIME_FIELD])
     except (OSError, IndexError):
         return None

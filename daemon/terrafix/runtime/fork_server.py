@@ -136,9 +136,14 @@ def answer_of(server: socket.socket, progress: Callable[[], int]) -> bytes:
 
 
 def processor_ticks(pid: int) -> int:
-    """-> processor time that a process has used, in clock ticks (proc(5), utime and stime). Raises OSError."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    """-> processor time that a process has used, in clock ticks (utime and stime). Raises OSError."""
+    fields = stat_fields(pid)
     return int(fields[11]) + int(fields[12])
+
+
+def stat_fields(pid: int) -> list[str]:
+    """-> fields of /proc/PID/stat after the name, which may hold any character (proc(5)). Raises OSError."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
 
 
 def set_parent_death_signal(parent_pid: int, number: signal.Signals | None) -> bool:
