@@ -8,7 +8,7 @@ import pytest
 
 from terrafix_tools.bench import finalised
 from terrafix_tools.finalise.before_after import Change
-from terrafix_tools.finalise.output import read_changes
+from terrafix_tools.finalise.output import read_flights
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.sections_run import finalised as section
 
@@ -35,10 +35,10 @@ def test_the_report_shows_before_and_after(tmp_path: Path) -> None:
     path.write_text(json.dumps({"flights": [{"before_after": [row]}, {}]}), encoding="utf-8")
     view = FlightView("a flight", [], [])
     assert section(view) == ""
-    view.before_after = read_changes(path)
+    view.finalised_flights = read_flights(path)
     shown = section(view)
     assert "map points px" in shown and "<td>8.2</td><td>7.0</td>" in shown
-    assert read_changes(tmp_path / "missing.json") == []
+    assert read_flights(tmp_path / "missing.json") == []
 
 
 def test_the_flights_of_the_bench_have_another_focal_length_than_described() -> None:

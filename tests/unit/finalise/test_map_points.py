@@ -36,7 +36,9 @@ def matched(seed: int = 1, *, wrong: int = 0, points: int = 40, roofs_m: float =
         q_w_c=quat_from_rot(R_W_C), agl_m=HEIGHT_M, sigma_floor=NOISE, threshold=0.03, search_radius=0.08, min_inliers=8
     )
     off = R_W_C @ exp_so3(np.array([0.01, -0.01, 0.01])), P_M - (1.0, -1.0, 5.0)
-    return MatchedPoints(described, ground, np.ones(points), given, *off, local_m=0.5, roofs_m=roofs_m, slope=0.01)
+    return MatchedPoints(
+        described, ground, np.ones(points), given, *off, k1=0.0, local_m=0.5, roofs_m=roofs_m, slope=0.01
+    )
 
 
 def test_the_points_give_the_pose_through_the_true_lens_and_their_heights() -> None:

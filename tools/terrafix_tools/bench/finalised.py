@@ -4,8 +4,9 @@ python -m terrafix_tools.bench.finalised FLIGHTS OUT [SECONDS]
 
 Flights of the Monte Carlo simulation (docs/monte-carlo.md) without faults, numbers 0 to FLIGHTS - 1, of 300 s if
 nothing else is given, a frame a second. The focal length is 3 % longer than described, stated to 5 %, and the lens has
-a radial coefficient that is not described. The smoother is given the factors that the flight has recorded; the truth is
-that of the simulation. OUT: a JSON file, written after every flight."""
+a radial coefficient that is not described. The smoother is given the factors that the flight has recorded, and what is
+kept of it is chosen as by `terrafix finalise`; the truth is that of the simulation. OUT: a JSON file, written after
+every flight."""
 
 import resource
 import time
@@ -20,10 +21,13 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.gate import CHI2_95
+from terrafix.core.pose import tangent_to_world
 from terrafix.messages import Message
 from terrafix_tools.bench.result_file import write_result
-from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
+from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
+from terrafix_tools.finalise.held_out import EVERY, choose
+from terrafix_tools.finalise.run import Placed, refined_track
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Run
 from terrafix_tools.montecarlo.plan import FlightPlan, plan
@@ -36,9 +40,9 @@ FOCAL_ERROR, FOCAL_SIGMA, K1_ERROR = 0.03, 0.05, -0.03  # of the true camera, re
 class RecordedRun(Run):
     """A simulated flight whose estimator keeps what the smoother takes."""
 
-    def __init__(self, drawn: FlightPlan) -> None:
+    def __init__(self, drawn: FlightPlan, hold_out_every: int = 0) -> None:
         super().__init__(drawn)
-        self.replayer = FlightReplayer()
+        self.replayer = FlightReplayer(hold_out_every)
         self._node = self.replayer.node
 
     def process(self, message: Message) -> list[Message]:
@@ -50,13 +54,12 @@ class RecordedRun(Run):
         graph.recorder.store_estimates()
         return graph
 
-    def errors(self, graph: FlightGraph, found: Smoothed) -> tuple[np.ndarray, np.ndarray]:
-        """-> error of every frame that has a node, east, north and up (N, 3) [m], and its covariance (N, 3, 3)."""
+    def errors(self, placed: dict[int, Placed]) -> tuple[np.ndarray, np.ndarray]:
+        """-> error of every frame, east, north and up (N, 3) [m], and its covariance (N, 3, 3), world axes."""
         errors_m, covs = [], []
-        for frame_id, node in graph.node_of.items():
-            r_w_c = found.poses[node].rotation().matrix()
-            errors_m.append(found.poses[node].translation() - self._flown.frames[frame_id].p_m)
-            covs.append(r_w_c @ found.covs[node][3:, 3:] @ r_w_c.T)
+        for frame_id, at in placed.items():
+            errors_m.append(at.pose.translation() - self._flown.frames[frame_id].p_m)
+            covs.append(tangent_to_world(at.cov, at.pose.rotation().matrix()))
         return np.array(errors_m), np.array(covs)
 
 
@@ -69,12 +72,17 @@ def uncalibrated(number: int, duration_s: float = DURATION_S) -> FlightPlan:
 
 def measure(number: int, duration_s: float = DURATION_S) -> dict[str, Any]:
     """One flight -> its row of the result."""
-    flight = RecordedRun(uncalibrated(number, duration_s))
+    without, flight = (RecordedRun(uncalibrated(number, duration_s), every) for every in (EVERY, 0))
+    choice = choose(without.fly(), without.replayer.estimators[-1])
     graph = flight.fly()
     begun_s = time.process_time()
-    found = smooth(graph)
+    found = smooth(graph, estimates_lens=choice.estimates_lens)
     cpu_s = time.process_time() - begun_s
-    errors_m, covs = flight.errors(graph, found)
+    refined = refined_track(graph, flight.replayer.estimators[-1])
+    solved = {frame_id: Placed(found.poses[n], found.covs[n], found.bias[n]) for frame_id, n in graph.node_of.items()}
+    refined_m = np.hypot(*flight.errors(refined)[0][:, :2].T)
+    solved_m = np.hypot(*flight.errors(solved)[0][:, :2].T)
+    errors_m, covs = flight.errors(solved if choice.kept else refined)
     px = graph.origin.camera.fx
     before_px, after_px = (float("nan") if one is None else one * px for one in found.map_residual)
     away_m = np.hypot(*errors_m[:, :2].T)
@@ -82,6 +90,13 @@ def measure(number: int, duration_s: float = DURATION_S) -> dict[str, Any]:
     return {
         "number": number,
         "frames": len(away_m),
+        "kept": choice.kept,
+        "lens": choice.estimates_lens,
+        "held_out_sigmas": choice.track.sigmas if choice.track else 0.0,
+        "refined_median_m": float(np.median(refined_m)),
+        "refined_p95_m": float(np.percentile(refined_m, 95)),
+        "solved_median_m": float(np.median(solved_m)),
+        "solved_p95_m": float(np.percentile(solved_m, 95)),
         "median_m": float(np.median(away_m)),
         "p95_m": float(np.percentile(away_m, 95)),
         "max_m": float(away_m.max()),

@@ -28,6 +28,7 @@ from terrafix.estimator.factors.three_view import (
 from terrafix.estimator.filter_state import scale_sigma
 from terrafix.estimator.models.bias_walk import BAROMETER_SCALE_SIGMA
 from terrafix.estimator.models.lens_prior import radial_k1_sigma
+from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.models.terrain import LEVEL_M
 from terrafix.estimator.state import (
     CALIBRATION_SIZE,
@@ -36,7 +37,9 @@ from terrafix.estimator.state import (
     HORIZONTAL,
     LOG_HEIGHT_SCALE,
     NORTH,
+    POSE_SIZE,
     RADIAL_K1,
+    ROTATION,
     TRANSLATION,
     UP,
 )
@@ -44,7 +47,7 @@ from terrafix.smoother.gnc import Covariances, OutlierCandidate, marginals, sett
 from terrafix_tools.finalise.fix_consistency import ambiguous_segments, information_shares, lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, RecordedNode
 from terrafix_tools.finalise.lens import Lens, as_described
-from terrafix_tools.finalise.map_points import FOCAL, K1, POSE, PoseRows, rows_of_pose
+from terrafix_tools.finalise.map_points import CONSTANT, FOCAL, K1, POSE, PoseRows, rows_of_pose
 from terrafix_tools.finalise.submaps import placed_states
 
 ROUNDS = 4  # relinearizations of custom factors; the last one moves a flight by millimetres
@@ -58,6 +61,7 @@ MIN_FOCAL_SIGMA = 1e-5  # of the prior of the focal length, relative: an exactly
 # 1-sigma of an estimated focal length, relative, by errors that all images have in common (model of the lens, principal
 # point, relief), beyond what the residuals say.
 FOCAL_MODEL_SIGMA = 0.008  # [measured: docs/finalise.md]
+POSE_SYMBOLS = gtsam.symbolChr(C(0)), gtsam.symbolChr(M(0))  # of variables that are poses
 READMISSIONS = 3  # passes in which outliers that the drift of the others had excluded may become inliers
 
 Progress = Callable[[int, int], None]
@@ -73,7 +77,8 @@ class Smoothed:
     with the 1-sigma of both of its numbers, ``lens_sigma``; ``sees_lens`` False: its focal length is as described.
     ``map_residual``: mean distance of the matched points of all inliers from their projection by the pose of the camera
     (not by the match's own one), normalised: by the last estimates in flight, and by the solution. ``moved_m`` (N,):
-    horizontal distance from those estimates, in which both have the same principal point."""
+    horizontal distance from those estimates, in which both have the same principal point. ``camera`` (N): poses before
+    the principal point is taken into account, as map matches see them."""
 
     poses: list[gtsam.Pose3]
     covs: np.ndarray
@@ -88,15 +93,28 @@ class Smoothed:
     sees_lens: bool
     map_residual: tuple[float | None, float | None]
     moved_m: np.ndarray
+    camera: list[gtsam.Pose3]
+
+    def on_map(self, fix: Fix) -> gtsam.Pose3:
+        """The camera of a map match in the axes of its map, which is off; a map that no other match knows is not."""
+        at = self.camera[fix.node]
+        offset_m = self.map_offset_m[fix.map_sigma_m][0] if fix.map_sigma_m in self.map_offset_m else np.zeros(3)
+        return gtsam.Pose3(at.rotation(), at.translation() - offset_m)
+
+    def lens_at(self, node: int) -> Lens:
+        return Lens(float(self.bias[node][RADIAL_K1]), self.lens.log_focal)
 
 
-def smooth(flight: FlightGraph, progress: Progress = lambda _done, _of: None) -> Smoothed:
-    """Raises RuntimeError (GTSAM's) when the measurements leave the system indeterminate."""
-    return _Smoothing(flight, progress).smoothed()
+def smooth(
+    flight: FlightGraph, progress: Progress = lambda _done, _of: None, *, estimates_lens: bool = True
+) -> Smoothed:
+    """``estimates_lens`` False: the focal length stays as described. Raises RuntimeError (GTSAM's) when the
+    measurements leave the system indeterminate."""
+    return _Smoothing(flight, progress, estimates_lens).smoothed()
 
 
 class _Smoothing:
-    def __init__(self, flight: FlightGraph, progress: Progress) -> None:
+    def __init__(self, flight: FlightGraph, progress: Progress, estimates_lens: bool = True) -> None:
         self._flight, self._progress = flight, progress
         self._nodes = flight.recorder.nodes
         self._begins = _begins(self._nodes)
@@ -109,7 +127,8 @@ class _Smoothing:
         # Only points that three keyframes see separate the lens from relief. Without them it stays as described, and
         # heights are as seen through it.
         camera = flight.origin.camera
-        self._sees_lens = any(node.triples is not None and len(node.triples.xy) for node in self._nodes)
+        seen = any(node.triples is not None and len(node.triples.xy) for node in self._nodes)
+        self._sees_lens = estimates_lens and seen
         self._focal_sigma = max(camera.focal_sigma if self._sees_lens else 0.0, MIN_FOCAL_SIGMA)
         self._rows: list[PoseRows] = []
         self._candidates: list[OutlierCandidate] = []
@@ -162,6 +181,8 @@ class _Smoothing:
                 graph.push_back(gtsam.PriorFactorPose3(C(i), node.prior[0], loose))
             for factor in (*node.factors, *self._calibration_factors(i, node), *self._odometry_factors(i, node)):
                 graph.push_back(self._linear(factor) if isinstance(factor, gtsam.CustomFactor) else factor)
+        for loop in self._flight.loops:
+            graph.push_back(self._linear(self._plane_factor(loop.parent, loop.node, loop.motion, loop.keyframe_m)))
         for j, sigma_m in enumerate(self._maps):
             sigmas = np.array(
                 [MAP_TURN_RAD] * 3 + [max(math.sqrt(shared_variance_m2(sigma_m)), EXACT_M)] * 2 + [LEVEL_M]
@@ -207,25 +228,28 @@ class _Smoothing:
         yield gtsam.LinearContainerFactor(gtsam.JacobianFactor(B(i), air, np.zeros(1), unit(1)), alone)
 
     def _odometry_factors(self, i: int, node: RecordedNode) -> Iterator[gtsam.NonlinearFactor]:
-        """Factors of the pairs and of the triples, reduced at the newest estimates of cameras and lens; the ground
-        plane is that of the flight."""
-        lens, camera = self._lens(i), self._flight.origin.camera
-        yield from self._three_view_factor(node, i, FocalKey(F(0), lens.log_focal))
-        if node.motion is None or node.motion.rays is None or node.keyframe_m is None:
-            return
-        rays, then = node.motion.rays, node.keyframe_m
-        keyframe, pose = self._values.atPose3(C(node.parent)), self._values.atPose3(C(i))
+        """Factors of the pairs and of the triples, reduced at the newest estimates of cameras and lens."""
+        yield from self._three_view_factor(node, i, FocalKey(F(0), self._lens(i).log_focal))
+        if node.motion is not None and node.motion.rays is not None and node.keyframe_m is not None:
+            yield self._plane_factor(node.parent, i, node.motion, node.keyframe_m)
+
+    def _plane_factor(self, parent: int, i: int, motion: RelativePose, then: np.ndarray) -> gtsam.CustomFactor:
+        """Of the pairs that two nodes see; the ground plane is that of the flight, in which ``parent`` was at ``then``
+        (3,)."""
+        rays, lens, camera = motion.rays, self._lens(i), self._flight.origin.camera
+        assert rays is not None
+        keyframe, pose = self._values.atPose3(C(parent)), self._values.atPose3(C(i))
         now = keyframe.translation()
         fall_m = rays.ground.slope_e * (now[EAST] - then[EAST]) + rays.ground.slope_n * (now[NORTH] - then[NORTH])
         height_m = rays.ground.height_m + float(now[UP] - then[UP]) - float(fall_m)
         ground = replace(rays.ground, height_m=max(height_m, 1.0))
         pairs = np.hstack([lens.rays(as_described(rays.pairs[:, xy], rays.k1)) for xy in (slice(0, 2), slice(2, 4))])
         sigma = float(lens.normalised(np.array(rays.sigma)))
-        keys = C(node.parent), C(i), B(i)
         repeats = float(np.sqrt(len(self._nodes)))  # relief is no new one in each pair: as a whole they give the prior
         noise = LensNoise(repeats * radial_k1_sigma(camera), repeats * camera.focal_sigma)
         of_plane = noise if self._sees_lens else None
-        yield plane_two_view_factor(*keys, keyframe, pose, pairs, sigma, ground, B(node.parent), lens.k1, of_plane)
+        keys = C(parent), C(i), B(i)
+        return plane_two_view_factor(*keys, keyframe, pose, pairs, sigma, ground, B(parent), lens.k1, of_plane)
 
     def _three_view_factor(self, node: RecordedNode, i: int, focal: FocalKey) -> Iterator[gtsam.NonlinearFactor]:
         seen = node.triples
@@ -252,7 +276,7 @@ class _Smoothing:
     def _linear(self, factor: gtsam.CustomFactor) -> gtsam.NonlinearFactor:
         around = gtsam.Values()
         for key in factor.keys():  # noqa: SIM118 (a factor is no dict)
-            is_pose = gtsam.symbolChr(key) == gtsam.symbolChr(C(0))
+            is_pose = gtsam.symbolChr(key) in POSE_SYMBOLS
             around.insert(key, self._values.atPose3(key) if is_pose else self._values.atVector(key))
         return gtsam.LinearContainerFactor(factor.linearize(around), around)
 
@@ -273,21 +297,9 @@ class _Smoothing:
 
     def _fix_factor(self, fix: Fix, seen: PoseRows, share: float) -> OutlierCandidate:
         keys = [M(self._maps.index(fix.map_sigma_m)), C(fix.node), B(fix.node), F(0)]
-        of_map = -seen.pose.inverse().AdjointMap()
-        around = gtsam.Values()
-        around.insert(keys[0], gtsam.Pose3())
-        around.insert(keys[1], seen.pose)
-        bias = self._values.atVector(keys[2]).copy()
-        bias[RADIAL_K1] = seen.lens.k1
-        around.insert(keys[2], bias)
-        around.insert(keys[3], np.array([seen.lens.log_focal]))
 
         def factor(weight: float) -> gtsam.NonlinearFactor:
-            rows = np.sqrt(share * weight) * seen.rows
-            by_bias = np.zeros((len(rows), CALIBRATION_SIZE))
-            by_bias[:, RADIAL_K1] = rows[:, K1]
-            by = [rows[:, POSE] @ of_map, rows[:, POSE], by_bias, rows[:, [FOCAL]]]
-            return linear_factor(keys, by, rows[:, -1], around)
+            return self._linear(map_match_factor(keys, seen, share * weight))
 
         return OutlierCandidate(factor(1.0), factor, GATE[6] * share)
 
@@ -413,6 +425,7 @@ class _Smoothing:
             covs += by_focal[:, :, None] * by_focal[:, None, :]
         lost_m = lost_sigma(self._flight, inliers[: len(fixes)], self._begins)
         covs[:, TRANSLATION, TRANSLATION] += lost_m[:, None, None] ** 2 * np.eye(3)
+        camera = list(poses)
         if (principal_point := self._flight.principal_point) is not None:
             for i, pose in enumerate(poses):
                 level, p_m = pose.rotation().matrix()[HORIZONTAL], pose.translation()
@@ -438,6 +451,7 @@ class _Smoothing:
             self._sees_lens,
             self._map_residual(inliers),
             moved_m,
+            camera,
         )
 
     def _map_residual(self, inliers: np.ndarray) -> tuple[float | None, float | None]:
@@ -466,17 +480,30 @@ def _begins(nodes: list[RecordedNode]) -> np.ndarray:
     return begins
 
 
-def linear_factor(
-    keys: list[int], by: list[np.ndarray], constant: np.ndarray, around: gtsam.Values
-) -> gtsam.NonlinearFactor:
-    """Residual ``constant`` + sum of ``by`` times the changes of ``keys`` from ``around``, whitened. GTSAM's own
-    constructor of a linear factor takes three keys at most."""
+def map_match_factor(keys: list[int], seen: PoseRows, information: float) -> gtsam.CustomFactor:
+    """Residual of a map match, its ``information`` times: on the offset of its map, the pose of the camera, its
+    calibration, and the focal length (``keys``).
 
-    def error(_this: object, _values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+    Rotation and translation of the camera are compared one by one, so that moving map and camera alike changes nothing.
+    With the logarithm of both together, the rotation in the residual made the offset of the map observable."""
+    rows = math.sqrt(information) * seen.rows
+    r_seen, p_seen = seen.pose.rotation(), seen.pose.translation()
+    by_k1 = np.zeros((len(rows), CALIBRATION_SIZE), order="F")
+    by_k1[:, RADIAL_K1] = rows[:, K1]
+
+    def error(_this: object, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        offset, pose = values.atPose3(keys[0]), values.atPose3(keys[1])
+        turn = gtsam.Rot3.Logmap(r_seen.between(pose.rotation()))
+        change = np.append(turn, r_seen.unrotate(pose.translation() - offset.translation() - p_seen))
+        lens = values.atVector(keys[2])[RADIAL_K1] - seen.lens.k1, values.atVector(keys[3])[0] - seen.lens.log_focal
         if jacobians is not None:
-            for i, one in enumerate(by):
-                jacobians[i] = np.asfortranarray(one)
-        return constant
+            by_pose, by_offset = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros((POSE_SIZE, POSE_SIZE))
+            by_pose[ROTATION, ROTATION] = gtsam.Rot3.LogmapDerivative(turn)
+            by_pose[TRANSLATION, TRANSLATION] = r_seen.between(pose.rotation()).matrix()
+            by_offset[TRANSLATION, TRANSLATION] = -r_seen.between(offset.rotation()).matrix()
+            jacobians[0] = np.asfortranarray(rows[:, POSE] @ by_offset)
+            jacobians[1] = np.asfortranarray(rows[:, POSE] @ by_pose)
+            jacobians[2], jacobians[3] = by_k1, np.asfortranarray(rows[:, [FOCAL]])
+        return np.asarray(rows[:, POSE] @ change + rows[:, [K1, FOCAL]] @ lens + rows[:, CONSTANT])
 
-    factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(constant)), keys, error)
-    return gtsam.LinearContainerFactor(factor.linearize(around), around)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(rows)), keys, error)

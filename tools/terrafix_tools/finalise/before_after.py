@@ -6,6 +6,7 @@ from typing import Any
 from rich.table import Table
 
 HEADER = ("", "before", "after")
+FINALISED, REFINED = "finalised", "refined"  # the solution in the table: of the batch smoother, or of the flight
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,20 @@ def table(rows: list[dict[str, Any]]) -> Table:
     for row in rows:
         shown.add_row(*Change(**row).cells())
     return shown
+
+
+def kept_line(flight: dict[str, Any]) -> str:
+    """Why finalised.csv has the refined positions of a flight; empty where it has the batch smoother's, and for a
+    summary of an older version."""
+    if flight.get("solution", FINALISED) == FINALISED:
+        return ""
+    kept = "The finalised positions are the refined ones of the flight"
+    track = flight["held_out"]["track"]
+    if track is None or not track["matches"]:
+        return f"{kept}: no map match could be held out to compare the batch solution with them."
+    distances = f"{track['before']:.1f} m from these on average, {track['after']:.1f} m from the batch solution"
+    enough = "too few to tell which is better" if track["sigmas"] == 0.0 else f"{track['sigmas']:+.1f} standard errors"
+    return f"{kept}: {track['matches']} map matches that were held out lie {distances} ({enough})."
 
 
 def _text(value: float | None, sigma: float | None) -> str:

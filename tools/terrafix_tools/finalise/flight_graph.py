@@ -23,6 +23,7 @@ from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import NavPrior
+from terrafix.estimator.relocalization_update import RelocalizationResult
 from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, POSE_SIZE, UP, NodeState
 from terrafix.messages import (
     MapMatch,
@@ -31,6 +32,7 @@ from terrafix.messages import (
     NavEstimate,
     Odometry,
     Origin,
+    Relocalization,
     VehicleState,
     Verdict,
 )
@@ -87,6 +89,17 @@ class Fix:
     k1: float
     tried: bool
     points: MatchedPoints | None
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """An accepted relocalisation: ``motion`` of ``node`` from the older node ``parent``, whose camera was at
+    ``keyframe_m`` (3,) when the ground plane of the motion was computed."""
+
+    node: int
+    parent: int
+    motion: RelativePose
+    keyframe_m: np.ndarray
 
 
 class GraphRecorder(GraphObserver):
@@ -170,6 +183,8 @@ class FlightGraph:
     origin: Origin
     recorder: GraphRecorder = field(default_factory=GraphRecorder)
     fixes: list[Fix] = field(default_factory=list)
+    held_out: list[Fix] = field(default_factory=list)  # map matches that the estimator was not given
+    loops: list[LoopClosure] = field(default_factory=list)
     node_of: dict[int, int] = field(default_factory=dict)
     refused: dict[str, int] = field(default_factory=dict)  # number of map matches that are not used, by verdict
     lost_sigma_m: dict[int, float] = field(default_factory=dict)  # node -> 1-sigma of a position that may be wrong
@@ -179,19 +194,42 @@ class FlightGraph:
     features: FeatureTracks = field(default_factory=FeatureTracks)
 
 
+class RecordedEstimator(Estimator):
+    """The estimator of ``flight``, which records its loop closures."""
+
+    def __init__(self, origin: Origin, prior: NavPrior | None, flight: FlightGraph) -> None:
+        super().__init__(origin, prior, flight.recorder.graph)
+        self._flight = flight
+
+    def feed_relocalization(self, seen: Relocalization) -> RelocalizationResult:
+        result = super().feed_relocalization(seen)
+        nodes = self._flight.node_of
+        if result.measurement is not None and {seen.frame_id, seen.keyframe_id} <= nodes.keys():
+            motion = result.measurement.motion
+            keyframe_m = np.asarray(result.measurement.pose.compose(motion.between.inverse()).translation())
+            self._flight.loops.append(LoopClosure(nodes[seen.frame_id], nodes[seen.keyframe_id], motion, keyframe_m))
+        return result
+
+
 class FlightReplayer:
     """Feeds a record, message after message, to the node that flew. ``flights``: one for each Origin, and each
-    InitialPosition, from which its estimator began."""
+    InitialPosition, from which its estimator began; ``estimators``: those of them. ``hold_out_every``: of the map
+    matches with a pose, one in so many is held out; 0: none."""
 
-    def __init__(self) -> None:
+    def __init__(self, hold_out_every: int = 0) -> None:
         self.flights: list[FlightGraph] = []
+        self.estimators: list[Estimator] = []
         self.node = EstimatorNode(make_estimator=self._make_estimator)
+        self._hold_out_every, self._with_pose = hold_out_every, 0
 
     def _make_estimator(self, origin: Origin, prior: NavPrior | None) -> Estimator:
         self.flights.append(FlightGraph(origin))
-        return Estimator(origin, prior, self.flights[-1].recorder.graph)
+        self.estimators.append(RecordedEstimator(origin, prior, self.flights[-1]))
+        return self.estimators[-1]
 
     def on(self, message: Message) -> Iterable[Message]:
+        if isinstance(message, MapMatch) and self._holds_out(message):
+            return []
         published = list(self.node.on(message))
         estimator = self.node.estimator
         if estimator is None:
@@ -210,29 +248,44 @@ class FlightReplayer:
             self._add_match(message, verdict, estimator)
         return published
 
+    def _holds_out(self, match: MapMatch) -> bool:
+        """Counts the matches with a pose, and holds out one in ``hold_out_every``, whose frame has a node."""
+        estimator = self.node.estimator
+        if not self._hold_out_every or estimator is None or match.verdict is not Verdict.ACCEPTED:
+            return False
+        self._with_pose += 1
+        fix = self._fix(match, estimator) if self._with_pose % self._hold_out_every == 0 else None
+        if isinstance(fix, Fix):
+            self.flights[-1].held_out.append(fix)
+        return isinstance(fix, Fix)
+
     def _add_match(self, received: MapMatch, verdict: Verdict, estimator: Estimator) -> None:
-        flight, match = self.flights[-1], solved(received)
-        node = flight.node_of.get(match.frame_id)
-        if node is not None:
+        flight, fix = self.flights[-1], self._fix(received, estimator)
+        if (node := flight.node_of.get(received.frame_id)) is not None:
             flight.lost_sigma_m[node] = estimator.hypotheses.anywhere_m
-        if node is None or match.verdict is not Verdict.ACCEPTED or match.pose is None or not determined(match):
-            reason = match.verdict if match.verdict is not Verdict.ACCEPTED else Verdict.STALE
-            flight.refused[str(reason)] = flight.refused.get(str(reason), 0) + 1
-            return
+        if isinstance(fix, Verdict):
+            flight.refused[str(fix)] = flight.refused.get(str(fix), 0) + 1
+        else:
+            flight.fixes.append(replace(fix, tried=verdict is not Verdict.AMBIGUOUS))
+
+    def _fix(self, received: MapMatch, estimator: Estimator) -> Fix | Verdict:
+        """The pose of a map match; or why there is none."""
+        node, match = self.flights[-1].node_of.get(received.frame_id), solved(received)
+        if match.verdict is not Verdict.ACCEPTED:
+            return match.verdict
+        if node is None or match.pose is None or not determined(match):
+            return Verdict.STALE
         pose, cov = measured_pose(match.pose, match.map_sigma_m, estimator.terrain)
-        tried = verdict is not Verdict.AMBIGUOUS
-        flight.fixes.append(
-            Fix(
-                node,
-                pose,
-                cov,
-                match.map_sigma_m,
-                match.position_only,
-                moved_by_lens(match, estimator.terrain),
-                match.radial_k1,
-                tried,
-                MatchedPoints.of(received, match, estimator.terrain),
-            )
+        return Fix(
+            node,
+            pose,
+            cov,
+            match.map_sigma_m,
+            match.position_only,
+            moved_by_lens(match, estimator.terrain),
+            match.radial_k1,
+            True,
+            MatchedPoints.of(received, match, estimator.terrain),
         )
 
 

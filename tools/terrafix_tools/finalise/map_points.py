@@ -49,8 +49,9 @@ class PointFit:
 @dataclass(frozen=True)
 class MatchedPoints:
     """All 2D-3D matches of a frame, also those that PnP has rejected. ``xy`` (N, 2): normalised by the description of
-    the camera; ``points_m`` (N, 3): on the map; ``weights`` (N,). ``r_w_c``, ``p_m``: the pose of PnP. ``local_m``,
-    ``roofs_m``, ``slope``: 1-sigma of what the ground as seen differs by from the map's: sideways, in height, slope."""
+    the camera; ``points_m`` (N, 3): on the map; ``weights`` (N,). ``r_w_c``, ``p_m``: the pose of PnP, by the radial
+    coefficient ``k1``. ``local_m``, ``roofs_m``, ``slope``: 1-sigma of what the ground as seen differs by from the
+    map's: sideways, in height, slope."""
 
     xy: np.ndarray
     points_m: np.ndarray
@@ -58,6 +59,7 @@ class MatchedPoints:
     given: PnpInput
     r_w_c: np.ndarray
     p_m: np.ndarray
+    k1: float
     local_m: float
     roofs_m: float
     slope: float
@@ -77,6 +79,7 @@ class MatchedPoints:
             match.pnp,
             r_w_c,
             p_m,
+            match.radial_k1,
             LOCAL_WARP * match.map_sigma_m,
             ROOFS * height_m,
             terrain.slope_sigma(height_m),
@@ -96,6 +99,11 @@ class MatchedPoints:
             return None
         projected, _, _ = project_with_jacobian(found.r_w_c, found.p_c_in_w_m, self.points_m)
         return PointFit(found.r_w_c, found.p_c_in_w_m, lens, rays, inliers, found.sigma, projected - rays)
+
+    def accepted(self) -> np.ndarray:
+        """(N,) bool: the points that PnP had accepted in flight."""
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(self.r_w_c), self.p_m)
+        return self.off(pose, Lens(self.k1)) < self.given.threshold
 
     def off(self, pose: gtsam.Pose3, lens: Lens) -> np.ndarray:
         """(N,) distance of every point from its projection by ``pose`` through ``lens``, normalised."""

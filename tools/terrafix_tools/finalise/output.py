@@ -60,17 +60,15 @@ def read_track(path: Path) -> list[tuple[float, float]]:
     return track
 
 
-def read_changes(path: Path) -> list[dict[str, Any]]:
-    """Rows of before and after of all flights of a summary; none where it has none, as of an older version. Raises
-    EvaluationError."""
+def read_flights(path: Path) -> list[dict[str, Any]]:
+    """The flights of a summary; none where it has none. Raises EvaluationError."""
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return []
     except (OSError, ValueError) as error:
         raise EvaluationError(f"{path}: cannot be read ({error}); write it again with 'terrafix finalise'") from None
-    flights = summary.get("flights", []) if isinstance(summary, dict) else []
-    return [row for flight in flights for row in flight.get("before_after", [])]
+    return list(summary.get("flights", [])) if isinstance(summary, dict) else []
 
 
 def _cells(row: FinalRow) -> list[str]:

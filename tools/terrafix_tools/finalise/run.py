@@ -5,10 +5,11 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -16,16 +17,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame, yaw_of
+from terrafix.core.map_error import shared_variance_m2
 from terrafix.core.pose import exp_so3, tangent_to_world
-from terrafix.estimator.state import EAST, HORIZONTAL, MOUNT_TILT, NORTH, UP
+from terrafix.estimator.estimator import Estimator
+from terrafix.estimator.state import EAST, HORIZONTAL, MOUNT_TILT, NORTH, POSE_SIZE, TRANSLATION, UP
 from terrafix.messages import Frame, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import versions
 from terrafix.recorder.reader import ReadResult, check_format, read_flight
 from terrafix_tools.estimates import NS
 from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
-from terrafix_tools.finalise.before_after import Change
+from terrafix_tools.finalise.before_after import FINALISED, REFINED, Change, kept_line
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
+from terrafix_tools.finalise.held_out import EVERY, Choice, Comparison, choose
 from terrafix_tools.finalise.output import TABLE, FinalRow, write
 from terrafix_tools.finalise.point_cloud import POINTS, VERTEX, cloud_name, write_ply
 
@@ -42,8 +46,12 @@ def finalise(folder: Path, *, progress: bool = False) -> dict[str, Any]:
     began_s = time.process_time()
     result = ReadResult()
     with _bar(progress) as step:
-        rows, flights = _replay(folder, result, step)
-        smoothed = [_smoothed(flight, rows, step) for flight in flights]
+        chosen = _choices(folder, step)
+        rows, replayer = _replay(folder, result, step)
+        smoothed = [
+            _smoothed(flight, estimator, choice, rows, step)
+            for (flight, estimator), choice in zip(_flown(replayer), chosen, strict=True)
+        ]
         summary: dict[str, Any] = {
             "record": [path.name for path in result.files],
             "cut_off": [path.name for path in result.truncated_files],
@@ -56,7 +64,7 @@ def finalise(folder: Path, *, progress: bool = False) -> dict[str, Any]:
     summary["cpu_s"] = round(time.process_time() - began_s, 2)
     out = folder if folder.is_dir() else folder.parent
     write(out, list(rows.values()), summary)
-    for i, (flight, (_, points)) in enumerate(zip(flights, smoothed, strict=True)):
+    for i, ((flight, _), (_, points)) in enumerate(zip(_flown(replayer), smoothed, strict=True)):
         axes = LocalFrame(flight.origin.lat_deg, flight.origin.lon_deg)
         write_ply(out / cloud_name(i), points, axes)
     return summary
@@ -72,6 +80,8 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
         fixes = flight["map_matches"]
         if not fixes["believed"]:
             yield "No map match was accepted: the track follows from the start coordinate and odometry alone."
+        if line := kept_line(flight):
+            yield line
         for why in flight["not_placed"]:
             yield f"{why['frames']} frames have no position: {why['why']}."
     yield f"{sum(flight['points'] for flight in summary['flights'])} points of the ground in {folder / POINTS}"
@@ -84,12 +94,32 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
 
 def flights_of(folder: Path) -> list[FlightGraph]:
     """Flights of a record, as the smoother takes them. Raises SourceError."""
-    return _replay(folder, ReadResult(), lambda _name, _done, _of: None)[1]
+    return [flight for flight, _ in _flown(_replay(folder, ReadResult(), _no_step)[1])]
 
 
-def _replay(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, FinalRow], list[FlightGraph]]:
+def _no_step(_name: str, _done: int, _of: int | None) -> None:
+    """Progress that nobody sees."""
+
+
+def _flown(replayer: FlightReplayer) -> list[tuple[FlightGraph, Estimator]]:
+    """The flights of a record that have a frame, each with its estimator."""
+    flown = zip(replayer.flights, replayer.estimators, strict=True)
+    return [(flight, estimator) for flight, estimator in flown if flight.node_of]
+
+
+def _choices(folder: Path, step: Step) -> list[Choice]:
+    """By the map matches that each flight is replayed without."""
+    _, replayer = _replay(folder, ReadResult(), step, hold_out_every=EVERY)
+    return [
+        choose(flight, estimator, lambda done, of: step("compare", done, of)) for flight, estimator in _flown(replayer)
+    ]
+
+
+def _replay(
+    folder: Path, result: ReadResult, step: Step, hold_out_every: int = 0
+) -> tuple[dict[int, FinalRow], FlightReplayer]:
     """-> a row for every frame, in order of arrival; the flights of the record."""
-    replayer = FlightReplayer()
+    replayer = FlightReplayer(hold_out_every)
     rows: dict[int, FinalRow] = {}
     for _, _, message in read_flight(folder, result):
         if isinstance(message, Frame):
@@ -105,37 +135,64 @@ def _replay(folder: Path, result: ReadResult, step: Step) -> tuple[dict[int, Fin
         raise SourceError(f"{folder}: {where} has {missing}{also}; was the source of the flight opened?")
     for flight in replayer.flights:
         flight.recorder.store_estimates()
-    return rows, [flight for flight in replayer.flights if flight.node_of]
+    return rows, replayer
 
 
-def _smoothed(flight: FlightGraph, rows: dict[int, FinalRow], step: Step) -> tuple[dict[str, Any], np.ndarray]:
+def _smoothed(
+    flight: FlightGraph, estimator: Estimator, choice: Choice, rows: dict[int, FinalRow], step: Step
+) -> tuple[dict[str, Any], np.ndarray]:
     """Fills the rows of one flight. -> its part of the summary, and its point cloud."""
     try:
-        found = smooth(flight, lambda done, of: step("smooth", done, of))
+        found = smooth(flight, lambda done, of: step("smooth", done, of), estimates_lens=choice.estimates_lens)
     except RuntimeError as error:  # GTSAM: the system is indeterminate
         reason = f"the measurements do not determine the track ({str(error).strip().splitlines()[0]})"
-        summary = _summary(flight, None, [{"frames": len(flight.node_of), "why": reason}])
+        summary = _summary(flight, None, choice, [{"frames": len(flight.node_of), "why": reason}])
         return {**summary, "points": 0}, np.zeros(0, VERTEX)
     frame = LocalFrame(flight.origin.lat_deg, flight.origin.lon_deg)
     r_b_c = Mount.of(flight.origin.camera).r_b_c()
+    refined = {} if choice.kept else refined_track(flight, estimator)
     lost: Counter[int] = Counter()
     for frame_id, node in flight.node_of.items():
         if not found.placed[node]:
             lost[int(found.begins[node])] += 1
         elif frame_id in rows:
-            _fill(rows[frame_id], found, node, frame, r_b_c)
+            placed = Placed(found.poses[node], found.covs[node], found.bias[node])
+            _fill(rows[frame_id], refined.get(frame_id, placed), frame, r_b_c)
     why = "no map match is accepted there, and its start is unknown"
-    summary = _summary(flight, found, [{"frames": count, "why": why} for count in lost.values()])
+    summary = _summary(flight, found, choice, [{"frames": count, "why": why} for count in lost.values()])
     cameras = {frame_id: found.poses[node] for frame_id, node in flight.node_of.items() if found.placed[node]}
     points = flight.features.triangulated(cameras, found.lens)
     return {**summary, "points": len(points)}, points
 
 
-def _fill(row: FinalRow, found: Smoothed, node: int, frame: LocalFrame, r_b_c: np.ndarray) -> None:
-    pose = found.poses[node]
-    r_w_c, p = pose.rotation().matrix(), pose.translation()
-    cov = tangent_to_world(found.covs[node], r_w_c)
-    tilt = exp_so3(np.array([*found.bias[node][MOUNT_TILT], 0.0]))
+@dataclass(frozen=True)
+class Placed:
+    """A camera with the covariance of its pose (6, 6), tangent order, and its calibration state."""
+
+    pose: gtsam.Pose3
+    cov: np.ndarray
+    bias: np.ndarray
+
+
+def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, Placed]:
+    """By frame: the positions that the estimator refines after landing, as in estimates.csv; the attitude is the last
+    one in flight."""
+    map_var = shared_variance_m2(estimator.map_sigma_m)
+    placed = {}
+    for frame_id, (p_m, cov_m2) in estimator.refine().items():
+        if (node := flight.node_of.get(frame_id)) is None:
+            continue
+        state = flight.recorder.nodes[node].state
+        r, cov = state.pose.rotation().matrix(), np.zeros((POSE_SIZE, POSE_SIZE))
+        cov[TRANSLATION, TRANSLATION] = r.T @ (cov_m2 + np.diag([map_var, map_var, 0.0])) @ r
+        placed[frame_id] = Placed(gtsam.Pose3(state.pose.rotation(), p_m), cov, state.bias)
+    return placed
+
+
+def _fill(row: FinalRow, placed: Placed, frame: LocalFrame, r_b_c: np.ndarray) -> None:
+    r_w_c, p = placed.pose.rotation().matrix(), placed.pose.translation()
+    cov = tangent_to_world(placed.cov, r_w_c)
+    tilt = exp_so3(np.array([*placed.bias[MOUNT_TILT], 0.0]))
     row.lat_deg, row.lon_deg = frame.to_wgs84(float(p[EAST]), float(p[NORTH]))
     row.alt_amsl_m = float(p[UP])
     row.sigma_e_m, row.sigma_n_m, row.sigma_u_m = (math.sqrt(float(cov[i, i])) for i in (EAST, NORTH, UP))
@@ -143,7 +200,9 @@ def _fill(row: FinalRow, found: Smoothed, node: int, frame: LocalFrame, r_b_c: n
     row.yaw_deg = math.degrees(yaw_of(r_w_c @ (r_b_c @ tilt).T)) % 360.0
 
 
-def _summary(flight: FlightGraph, found: Smoothed | None, not_placed: list[dict[str, Any]]) -> dict[str, Any]:
+def _summary(
+    flight: FlightGraph, found: Smoothed | None, choice: Choice, not_placed: list[dict[str, Any]]
+) -> dict[str, Any]:
     accepted = int(found.inliers.sum()) if found else 0
     offsets = found.map_offset_m if found else {}
     tilt_deg = np.degrees(np.median(found.bias[:, MOUNT_TILT], axis=0)) if found else None
@@ -166,11 +225,22 @@ def _summary(flight: FlightGraph, found: Smoothed | None, not_placed: list[dict[
             for sigma_m, (offset, sigmas) in offsets.items()
         ],
         "not_placed": not_placed,
-        "before_after": _changes(flight, found) if found else [],
+        "solution": FINALISED if choice.kept else REFINED,
+        "held_out": {"lens": _compared(choice.lens), "track": _compared(choice.track)},
+        "before_after": _changes(flight, found, choice) if found else [],
     }
 
 
-def _changes(flight: FlightGraph, found: Smoothed) -> list[dict[str, Any]]:
+def _compared(compared: Comparison | None) -> dict[str, Any] | None:
+    """As in finalised.json: the fields of ``Comparison``."""
+    return (
+        None
+        if compared is None
+        else {k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(compared).items()}
+    )
+
+
+def _changes(flight: FlightGraph, found: Smoothed, choice: Choice) -> list[dict[str, Any]]:
     """Rows of the table as in finalised.json, fields of ``Change``."""
     camera, (k1, k1_sigma) = flight.origin.camera, flight.radial_k1
     focal_px, sigma_px = camera.fx, camera.fx * camera.focal_sigma
@@ -184,6 +254,12 @@ def _changes(flight: FlightGraph, found: Smoothed) -> list[dict[str, Any]]:
         Change("radial coefficient", "", k1, k1_sigma, found.lens.k1, found.lens_sigma.k1),
         Change("map points from the camera's pose, mean", "px", before_px, None, after_px, None),
     ]
+    for what, compared in (
+        ("estimated lens: held-out map points", choice.lens),
+        ("held-out map matches", choice.track),
+    ):
+        if compared is not None and compared.matches:
+            rows.append(Change(f"{what}, mean", compared.unit, compared.before, None, compared.after, None))
     moved_m = found.moved_m[found.placed]
     if len(moved_m):
         rows.append(Change("positions moved, median", "m", None, None, float(np.median(moved_m)), None))

@@ -71,7 +71,7 @@ class FlightView:
     compared: dict[str, Compared] = field(default_factory=dict)  # by file, if there is ground truth
     truth_track: list[Truth] = field(default_factory=list)
     finalised: list[tuple[float, float]] = field(default_factory=list)  # latitude, longitude of finalised.csv
-    before_after: list[dict[str, Any]] = field(default_factory=list)  # of all flights of finalised.json
+    finalised_flights: list[dict[str, Any]] = field(default_factory=list)  # of finalised.json
     evaluation: dict[str, Any] | None = None
     peer: dict[str, Any] = field(default_factory=dict)  # peer.json of the simulated autopilot
     cut_off: int = 0  # number of record files without end

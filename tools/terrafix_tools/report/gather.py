@@ -32,7 +32,7 @@ from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, RowTable, read_rows
 from terrafix_tools.evaluate import compare, metrics, read_summary, read_truth, truth_sigma_of
 from terrafix_tools.finalise.output import SUMMARY as FINALISED_SUMMARY
 from terrafix_tools.finalise.output import TABLE as FINALISED
-from terrafix_tools.finalise.output import read_changes, read_track
+from terrafix_tools.finalise.output import read_flights, read_track
 from terrafix_tools.log.contents import Contents
 from terrafix_tools.report.data import FlightView, RejectedMatch
 from terrafix_tools.report.innovations import Innovations
@@ -64,7 +64,7 @@ def gather(folder: Path, truth_path: Path | None) -> FlightView:
     view.peer = _read_peer(folder / "peer.json")
     if (folder / FINALISED).is_file():
         view.finalised = read_track(folder / FINALISED)
-        view.before_after = read_changes(folder / FINALISED_SUMMARY)
+        view.finalised_flights = read_flights(folder / FINALISED_SUMMARY)
     default_truth = folder / "truth.csv"
     if truth_path is None and default_truth.is_file():
         truth_path = default_truth

@@ -6,7 +6,7 @@ from html import escape
 
 import numpy as np
 
-from terrafix_tools.finalise.before_after import HEADER, Change
+from terrafix_tools.finalise.before_after import HEADER, Change, kept_line
 from terrafix_tools.report import document
 from terrafix_tools.report.charts import HALF_WIDTH, Chart, clock
 from terrafix_tools.report.data import FlightView, radius95_m
@@ -18,9 +18,10 @@ BINS = 40
 
 def finalised(view: FlightView) -> str:
     """What the smoother after landing has changed; empty where it did not run."""
-    rows: list[list[object]] = [[*Change(**row).cells()] for row in view.before_after]
-    shown = document.table([*HEADER], rows) if rows else ""
-    return f"<h2>Finalised after landing</h2>{shown}" if rows else ""
+    changes = [row for flight in view.finalised_flights for row in flight.get("before_after", [])]
+    rows: list[list[object]] = [[*Change(**row).cells()] for row in changes]
+    lines = "".join(f"<p>{escape(line)}</p>" for line in map(kept_line, view.finalised_flights) if line)
+    return f"<h2>Finalised after landing</h2>{lines}{document.table([*HEADER], rows)}" if rows else ""
 
 
 def timing(view: FlightView) -> str:

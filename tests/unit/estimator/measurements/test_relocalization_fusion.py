@@ -4,10 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from recorded_flight import seen_again
 from simulated_flight import (
     ORIGIN,
-    PAIRS,
-    SIGMA_NORM,
     EstimatorRun,
     Flight,
     blind,
@@ -25,36 +24,14 @@ from terrafix.messages import (
     Message,
     Odometry,
     Prediction,
-    Relocalization,
     SourceLabel,
     ThermalBand,
     Verdict,
 )
-from textured_ground import apply, homography
 
 FRAMES, MAP_UNTIL = 120, 10  # after a few map matches there is no map
 GAP = range(60, 72)  # frames in which nothing is tracked, and after which a fragment begins
 KEYFRAME, AGAIN = 57, 100  # the keyframe before the gap, and the frame that sees its ground again
-
-
-def seen_again(flight: Flight, keyframe: int, i: int, *, shown: int | None = None, fragment_id: int = 0) -> Message:
-    """Frame i sees the ground of ``keyframe``; or, by mistake, that of the frame ``shown``."""
-    rng = np.random.default_rng([keyframe, i])
-    truth = keyframe if shown is None else shown
-    xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
-    matrix = homography((flight.r_w_c[truth], flight.p_m[truth]), (flight.r_w_c[i], flight.p_m[i]))
-    seen = apply(matrix, xy) + rng.normal(0.0, SIGMA_NORM, xy.shape)
-    return Relocalization(
-        t_ns=t_ns(i),
-        frame_id=i,
-        fragment_id=fragment_id,
-        keyframe_id=keyframe,
-        keyframe_fragment_id=0,
-        two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([xy, seen])],
-        sigma_norm=SIGMA_NORM,
-        inliers=PAIRS,
-        tracked=PAIRS,
-    )
 
 
 def without_map(messages: list[Message]) -> list[Message]:
