@@ -73,7 +73,7 @@ def uncalibrated(number: int, duration_s: float = DURATION_S) -> FlightPlan:
 def measure(number: int, duration_s: float = DURATION_S) -> dict[str, Any]:
     """One flight -> its row of the result."""
     without, flight = (RecordedRun(uncalibrated(number, duration_s), every) for every in (EVERY, 0))
-    choice = choose(without.fly(), without.replayer.estimators[-1])
+    choice = choose(without.fly())
     graph = flight.fly()
     begun_s = time.process_time()
     found = smooth(graph, estimates_lens=choice.estimates_lens)

@@ -46,9 +46,11 @@ def kept_line(flight: dict[str, Any]) -> str:
     track = flight["held_out"]["track"]
     if track is None or not track["matches"]:
         return f"{kept}: no map match could be held out to compare the batch solution with them."
-    distances = f"{track['before']:.1f} m from these on average, {track['after']:.1f} m from the batch solution"
+    distances = (
+        f"{track['before']:.1f} px from the estimates in flight, {track['after']:.1f} px from the batch solution"
+    )
     enough = "too few to tell which is better" if track["sigmas"] == 0.0 else f"{track['sigmas']:+.1f} standard errors"
-    return f"{kept}: {track['matches']} map matches that were held out lie {distances} ({enough})."
+    return f"{kept}: {track['matches']} map matches that were held out are {distances} ({enough})."
 
 
 def _text(value: float | None, sigma: float | None) -> str:

@@ -1,17 +1,19 @@
 """Which solution of a flight map matches prefer that none of them was given (cross-validation).
 
-The record is replayed once more without one in EVERY of its map matches. Refined positions and the batch
-smoother's are compared at these: an estimated lens with the described one by the reprojection error of the points, both
-tracks by the horizontal distance, because the refined one has no attitude of its own."""
+The record is replayed once more without one in EVERY of its map matches. By the reprojection error of the points of
+these, the batch smoother's solution is compared with the last estimates in flight, and an estimated lens with the
+described one. A distance of positions alone would not do: a match by itself confuses position and tilt, and the same
+error of the lens is in it as in the estimates in flight."""
 
+import math
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
-from terrafix.estimator.estimator import Estimator
-from terrafix.estimator.state import HORIZONTAL
 from terrafix_tools.finalise.batch_smoother import Progress, Smoothed, smooth
-from terrafix_tools.finalise.flight_graph import FlightGraph
+from terrafix_tools.finalise.flight_graph import Fix, FlightGraph
+from terrafix_tools.finalise.lens import Lens
 
 EVERY = 3  # of the map matches of a flight, one in so many is held out [tuned]
 # Successive held-out matches whose errors count as one number: they lie over the same ground, with the same error of
@@ -71,8 +73,8 @@ class Comparison:
 @dataclass(frozen=True)
 class Choice:
     """``estimates_lens``: the focal length is estimated, else as described; ``lens``: described against estimated, None
-    where the flight does not determine it. ``track``: refined positions against the batch smoother's; None: one of both
-    has no solution. ``kept``: the batch smoother's solution is the finalised one, else the refined positions are."""
+    where the flight does not determine it. ``track``: the last estimates in flight against the batch smoother's; None:
+    it has no solution. ``kept``: the batch smoother's solution is the finalised one, else the refined positions are."""
 
     estimates_lens: bool
     lens: Comparison | None
@@ -80,24 +82,23 @@ class Choice:
     kept: bool
 
 
-def choose(flight: FlightGraph, estimator: Estimator, progress: Progress = lambda _done, _of: None) -> Choice:
-    """``flight``: replayed without its ``held_out`` matches, by ``estimator``, which is refined here.
+def choose(flight: FlightGraph, progress: Progress = lambda _done, _of: None) -> Choice:
+    """``flight``: replayed without its ``held_out`` matches.
 
     Refined positions do not reach beyond a reset of the graph, and their heights are those of the described lens. A
     flight with a reset, or one that determines its lens, keeps the batch smoother's solution unless the held-out
     matches say that it is worse; any other one only if they say that it is better."""
-    refined_m, _ = estimator.graph.refine()
     try:
         found = smooth(flight, progress, estimates_lens=False)
         lens, estimated = None, _estimated(flight, progress)
         if estimated is not None:
-            lens = Comparison.of(_reprojection_px(flight, found), _reprojection_px(flight, estimated), "px")
+            lens = Comparison.of(_smoothed_px(flight, found), _smoothed_px(flight, estimated), "px")
             if not lens.worse:
                 found = estimated
     except RuntimeError:  # GTSAM: the system is indeterminate
         return Choice(False, None, None, False)
     estimates_lens = found is estimated
-    track = Comparison.of(*_distances_m(flight, refined_m, found), "m")
+    track = Comparison.of(_in_flight_px(flight), _smoothed_px(flight, found), "px")
     refined_lacks = estimates_lens or any(node.again for node in flight.recorder.nodes)
     return Choice(estimates_lens, lens, track, not track.worse if refined_lacks else track.better)
 
@@ -111,27 +112,21 @@ def _estimated(flight: FlightGraph, progress: Progress) -> Smoothed | None:
     return found if determined else None
 
 
-def _distances_m(flight: FlightGraph, refined_m: np.ndarray, found: Smoothed) -> tuple[np.ndarray, np.ndarray]:
-    """-> horizontal distance of each held-out match from the refined position and from the solution, (F,) each. The
-    position of a match is that through the lens of the track: a wrong lens moves both alike."""
-    fixes = [fix for fix in flight.held_out if found.placed[fix.node] and np.isfinite(refined_m[fix.node]).all()]
-    away_m = []
-    for fix in fixes:
-        lens = found.lens_at(fix.node)
-        change = fix.by_lens @ np.array([lens.k1 - fix.k1, lens.log_focal])
-        seen = fix.pose, fix.pose.retract(change)
-        tracks_m = refined_m[fix.node], found.on_map(fix).translation()
-        away_m.append([np.hypot(*(p_m - at.translation())[HORIZONTAL]) for p_m, at in zip(tracks_m, seen, strict=True)])
-    before, after = np.array(away_m).reshape(-1, 2).T
-    return before, after
+def _smoothed_px(flight: FlightGraph, found: Smoothed) -> np.ndarray:
+    """(F,) error of each held-out match with points, by the solution."""
+    fixes = [fix for fix in flight.held_out if fix.points is not None]
+    return np.array([_off_px(flight, fix, found.on_map(fix), found.lens_at(fix.node)) for fix in fixes])
 
 
-def _reprojection_px(flight: FlightGraph, found: Smoothed) -> np.ndarray:
-    """(F,) mean distance of the points of each held-out match that PnP had accepted, in pixels as described."""
-    fx, errors = flight.origin.camera.fx, list[float]()
-    for fix in flight.held_out:
-        if fix.points is not None and (agree := fix.points.accepted()).any():
-            lens = found.lens_at(fix.node)
-            off = fix.points.off(found.on_map(fix), lens)[agree]
-            errors.append(float(np.mean(off)) * fx * float(np.exp(lens.log_focal)))
-    return np.array(errors)
+def _in_flight_px(flight: FlightGraph) -> np.ndarray:
+    """(F,) ... by the last estimates in flight, whose lens is the described one with the newest radial coefficient."""
+    lens, nodes = Lens(flight.radial_k1[0]), flight.recorder.nodes
+    fixes = [fix for fix in flight.held_out if fix.points is not None]
+    return np.array([_off_px(flight, fix, nodes[fix.node].state.pose, lens) for fix in fixes])
+
+
+def _off_px(flight: FlightGraph, fix: Fix, pose: gtsam.Pose3, lens: Lens) -> float:
+    """Mean distance of the points of a match that PnP had accepted from their projection, pixels of the image."""
+    assert fix.points is not None
+    off = fix.points.off(pose, lens)[fix.points.accepted()]
+    return float(np.mean(off)) * flight.origin.camera.fx * math.exp(lens.log_focal)

@@ -110,9 +110,7 @@ def _flown(replayer: FlightReplayer) -> list[tuple[FlightGraph, Estimator]]:
 def _choices(folder: Path, step: Step) -> list[Choice]:
     """By the map matches that each flight is replayed without."""
     _, replayer = _replay(folder, ReadResult(), step, hold_out_every=EVERY)
-    return [
-        choose(flight, estimator, lambda done, of: step("compare", done, of)) for flight, estimator in _flown(replayer)
-    ]
+    return [choose(flight, lambda done, of: step("compare", done, of)) for flight, _ in _flown(replayer)]
 
 
 def _replay(
@@ -255,8 +253,8 @@ def _changes(flight: FlightGraph, found: Smoothed, choice: Choice) -> list[dict[
         Change("map points from the camera's pose, mean", "px", before_px, None, after_px, None),
     ]
     for what, compared in (
-        ("estimated lens: held-out map points", choice.lens),
-        ("held-out map matches", choice.track),
+        ("held-out map points: estimated lens", choice.lens),
+        ("held-out map points", choice.track),
     ):
         if compared is not None and compared.matches:
             rows.append(Change(f"{what}, mean", compared.unit, compared.before, None, compared.after, None))
