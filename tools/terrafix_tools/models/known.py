@@ -51,7 +51,8 @@ def state_of(model: StoredModel) -> State:
 
 def _readable(folder: Path) -> None:
     try:
-        if folder.exists():
-            next(folder.iterdir(), None)
+        next(folder.iterdir(), None)
+    except FileNotFoundError:
+        pass
     except OSError as error:
         raise ModelError(f"{folder}: cannot be read ({error.strerror}); choose another --folder") from None
