@@ -92,6 +92,14 @@ def test_a_python_without_the_venv_module_is_detected(tmp_path: Path) -> None:
     assert "venv module is missing" in done.stderr and "apt install python3.11-venv" in done.stderr
 
 
+def test_a_python_that_is_not_to_be_had_is_a_row_with_the_reason(tmp_path: Path) -> None:
+    tools = {name: f'exec {shutil.which(name)} "$@"' for name in ("mkdir", "date")}
+    done = attempt(tmp_path, "sh scripts/pythons 3.12 3.14", **tools, id="echo 1000")
+    assert done.returncode == 0, done.stderr
+    assert "| 3.12 | not to be had here: no python3.12 with venv on the PATH | | | |\n" in done.stdout
+    assert "python3.14 with venv on the PATH, and no root rights or no debootstrap for sid |" in done.stdout
+
+
 def test_commands_and_options_in_the_readme_exist() -> None:
     from typer.testing import CliRunner
 
