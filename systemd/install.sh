@@ -1,7 +1,7 @@
 #!/bin/sh
 # Installs Terrafix as a systemd service: virtual environment in /opt/terrafix, settings in /etc/terrafix.
 #
-#   sudo systemd/install.sh [--python /path/to/python3.11] [--prefix DIR] [--no-pip] [--package WHEEL]
+#   sudo systemd/install.sh [--python /path/to/python3.13] [--prefix DIR] [--no-pip] [--package WHEEL]
 #
 # Run it again to upgrade: an existing /etc/terrafix/terrafix.toml is not changed. --prefix installs the files below
 # DIR and starts nothing (for images and tests); --no-pip does not change the virtual environment. --package installs
@@ -27,22 +27,23 @@ if [ -z "$prefix" ] && [ "$(id -u)" -ne 0 ]; then
     exit 2
 fi
 
-# gtsam 4.3 has wheels for Python 3.11 and later; JetPack 6 includes 3.10 (docs/jetson.md describes how to install a
+# gtsam 4.3 has wheels for Python 3.11 to 3.14; JetPack 6 includes 3.10 (docs/jetson.md describes how to install a
 # newer one).
 if [ "$pip" = yes ]; then
     if [ -d "$package" ] && [ ! -f "$package/pyproject.toml" ]; then
         echo "install.sh: $package is no source tree; give the wheel with --package" >&2
         exit 2
     fi
-    for candidate in $python python3.12 python3.11 python3; do
-        if command -v "$candidate" >/dev/null 2>&1 &&
-            "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+    for candidate in ${python:-python3 python3.14 python3.13 python3.12 python3.11}; do
+        found=$("$candidate" --version 2>/dev/null) || continue
+        if "$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))'; then
             chosen=$candidate
             break
         fi
+        other=${other:-$found}
     done
     if [ -z "${chosen:-}" ]; then
-        echo "install.sh: no Python 3.11 or newer found; see docs/jetson.md, then give --python PATH" >&2
+        echo "install.sh: needs Python 3.11 to 3.14; found ${other:-none}. See docs/jetson.md, then give --python PATH" >&2
         exit 1
     fi
     "$chosen" -m venv "$prefix/opt/terrafix/venv"

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import stat
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -38,9 +39,11 @@ class StoredModel:
     engines: Path
 
     def exists(self) -> bool:
-        """Raises ModelFileError without read permission."""
+        """Raises ModelFileError without read permission, which ``is_file`` hides since Python 3.14."""
         try:
-            return self.path.is_file()
+            return stat.S_ISREG(self.path.stat().st_mode)
+        except (FileNotFoundError, NotADirectoryError):
+            return False
         except OSError as error:
             raise ModelFileError(f"{self.path}: cannot be read ({error.strerror}); check permissions") from None
 

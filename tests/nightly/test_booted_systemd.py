@@ -28,8 +28,8 @@ from terrafix_tools.sim.camera.stream import FrameStream
 pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.real_time]
 
 ROOT = Path(__file__).resolve().parents[2]
-SUITE, MIRROR = "bookworm", "http://deb.debian.org/debian"
-INCLUDED = "systemd,systemd-sysv,dbus,python3"
+SUITE, ARCH = "bookworm", "amd64"
+INCLUDED = ("systemd", "systemd-sysv", "dbus", "python3")
 INSTALL_S, WAIT_S = 1800.0, 300.0  # limits; the machine may be busy
 WATCHDOG_S = 10.0  # WatchdogSec= of the unit
 STOP_S = 45.0  # TimeoutStopSec= of the unit
@@ -98,8 +98,7 @@ def system(tmp_path_factory: pytest.TempPathFactory, surroundings: Surroundings)
     if os.geteuid() or not all(shutil.which(name) for name in ("systemd-nspawn", "debootstrap")):
         pytest.skip("SYSTEMD MISSING: needs root, systemd-nspawn and debootstrap")
     root = tmp_path_factory.mktemp("system")
-    root.chmod(0o755)  # the root folder of the container, which its users have to enter
-    do("debootstrap", "--variant=minbase", f"--include={INCLUDED}", SUITE, root, MIRROR)
+    do("sh", ROOT / "scripts" / "debian-root", SUITE, ARCH, root, *INCLUDED)
     of_debian = do("chroot", root, "python3", "-c", "import sys; print(sys.version_info[:2])").strip()
     if of_debian != str(sys.version_info[:2]):
         pytest.skip(f"SYSTEMD MISSING: the Python of Debian {SUITE} is another one than that of the test")

@@ -2,6 +2,7 @@
 
 import math
 import sqlite3
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,7 +27,7 @@ DATABASE_ERRORS = (sqlite3.DatabaseError, UnicodeDecodeError)
 
 
 class MapPackage:
-    """An open package, read only. Not thread-safe.
+    """An open package, read only. Not thread-safe. Closed by ``close``, or with the last of its views.
 
     A tile whose sha256 differs from the recorded one counts as missing and is listed in ``damaged_tiles``: a bad block
     on a disk costs one tile in flight, not the map. ``verify`` reads everything and raises."""
@@ -36,6 +37,7 @@ class MapPackage:
         self.manifest = manifest
         self.signed_by: tuple[str, ...] = ()  # ids of the signing keys
         self._db = db
+        self._close = weakref.finalize(self, db.close)
         self.tiles = TileStore(db, manifest.format_version)
         self.crs = CRS.from_user_input(manifest.crs)
         self._from_wgs84 = {
@@ -153,7 +155,7 @@ class MapPackage:
         return LocalMap(self, frame, self.layer(layer))
 
     def close(self) -> None:
-        self._db.close()
+        self._close()
         self.tiles.clear()
 
     def _check_vectors(self, table: str) -> None:

@@ -46,7 +46,8 @@ def connect(path: Path) -> sqlite3.Connection:
     if path.with_name(f"{path.name}-journal").exists():
         raise MapError(f"{path}: signing it was interrupted; run 'terrafix map sign' again")
     # immutable: SQLite takes no locks and writes no journal beside the file, so the file may be on a read-only medium.
-    return sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)
+    # check_same_thread: the last view of a package may be dropped, and so be closed, by another thread than its reader.
+    return sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True, check_same_thread=False)
 
 
 def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:

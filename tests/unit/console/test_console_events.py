@@ -1,7 +1,7 @@
 """Events of a flight: stored in order, sent once, over reconnections and restarts."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,8 +18,10 @@ from terrafix_tools.console.store.flights import StoredEvent
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Database:
-    return open_database(tmp_path)
+def database(tmp_path: Path) -> Iterator[Database]:
+    opened = open_database(tmp_path)
+    yield opened
+    opened.close()
 
 
 def new_flight(database: Database) -> str:

@@ -9,6 +9,7 @@ import sys
 import time
 import zlib
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -273,7 +274,7 @@ def test_a_disk_that_fills_amid_an_upload_costs_that_upload_and_nothing_else(tmp
             assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 20
             stored = sorted((disk.folder / "flights" / flight_id / "images").iterdir())
             assert [path.read_bytes() for path in stored] == [content for _, _, content in (*batch(1), *batch(11))]
-        with sqlite3.connect(disk.folder / FILE) as database:
+        with closing(sqlite3.connect(disk.folder / FILE)) as database:
             assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
 
 

@@ -110,6 +110,28 @@ def test_the_lock_file_has_every_dependency_within_its_range() -> None:
                 assert requirement.specifier.contains(version), f"requirements.lock has {name} {version}"
 
 
+def test_the_same_pythons_are_stated_installed_and_checked() -> None:
+    classified = [one.removeprefix("Programming Language :: Python :: ") for one in PROJECT["classifiers"]]
+    pythons = [version for version in classified if version.startswith("3.")]
+    oldest, newest = pythons[0], int(pythons[-1].removeprefix("3."))
+    assert pythons == [f"3.{minor}" for minor in range(int(oldest.removeprefix("3.")), newest + 1)]
+    assert PROJECT["requires-python"] == f">={oldest},<3.{newest + 1}"
+    stated = f"Python {oldest} to 3.{newest}"
+    for page in ("README.md", "docs/install.md", "docs/jetson.md", "Containerfile", "requirements.lock"):
+        assert stated in (ROOT / page).read_text(encoding="utf-8"), page
+    candidates = ["python3", *(f"python{version}" for version in reversed(pythons))]
+    for installer in ("scripts/install", "systemd/install.sh"):
+        text = (ROOT / installer).read_text(encoding="utf-8")
+        assert f"needs {stated}; found" in text and f"-{' '.join(candidates)}}}; do" in text, installer
+        assert f"not (3, {oldest.removeprefix('3.')}) <= sys.version_info < (3, {newest + 1})" in text, installer
+    for script, listed in (
+        ("scripts/pythons", f"set -- {' '.join(pythons)}"),
+        ("scripts/lock", f"for python in {' '.join(pythons)};"),
+        (".github/workflows/check.yml", "python: [" + ", ".join(f'"{version}"' for version in pythons) + "]"),
+    ):
+        assert listed in (ROOT / script).read_text(encoding="utf-8"), script
+
+
 def test_the_lock_file_names_no_host() -> None:
     assert not re.search(r"://|--index-url|--extra-index-url|--find-links|file:", LOCK)
 
@@ -191,5 +213,11 @@ def test_the_installer_of_the_wheel_installs_unit_and_settings(unpacked: Path, t
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "etc/systemd/system/terrafix.service").is_file()
     assert (tmp_path / "etc/terrafix/terrafix.toml").is_file()
+    stub = tmp_path / "python"
+    stub.write_text('#!/bin/sh\n[ "$1" = --version ] && echo "Python 3.15.2"\n')
+    stub.chmod(0o755)
+    command = ["sh", str(ROOT / "systemd" / "install.sh"), "--prefix", str(tmp_path), "--python", str(stub)]
+    too_new = subprocess.run(command, capture_output=True, text=True)
+    assert too_new.returncode == 1 and "needs Python 3.11 to 3.14; found Python 3.15.2. See" in too_new.stderr
     no_package = subprocess.run(["sh", str(installer), "--prefix", str(tmp_path)], capture_output=True, text=True)
     assert no_package.returncode == 2 and "give the wheel with --package" in no_package.stderr

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -60,7 +61,7 @@ def test_ci_runs_only_the_check_command() -> None:
     assert lines(ci) == ["set -eu", 'cd "$(dirname "$0")/.."', CHECK]
 
 
-@pytest.mark.parametrize("script", ["demo", "check", "install", "lock"])
+@pytest.mark.parametrize("script", ["demo", "check", "install", "lock", "nightly", "pythons"])
 def test_scripts_have_no_shell_syntax_errors(script: str) -> None:
     done = subprocess.run(["sh", "-n", f"scripts/{script}"], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -70,14 +71,17 @@ def test_scripts_have_no_shell_syntax_errors(script: str) -> None:
 def test_without_python_one_line_states_what_to_install(command: str, tmp_path: Path) -> None:
     done = attempt(tmp_path, command)
     assert done.returncode == 1
-    assert done.stderr.count("\n") == 1 and "needs Python 3.11 or newer; found none" in done.stderr
+    assert done.stderr.count("\n") == 1 and "needs Python 3.11 to 3.14; found none" in done.stderr
 
 
-def test_an_old_python_version_is_stated_in_the_error(tmp_path: Path) -> None:
-    old = 'if [ "$1" = --version ]; then echo "Python 3.10.12"; else exit 1; fi'
-    done = attempt(tmp_path, DEMO, python3=old)
+@pytest.mark.parametrize("version", ["3.10.12", "3.15.2"])
+def test_a_python_that_is_too_old_or_too_new_is_stated_in_the_error(version: str, tmp_path: Path) -> None:
+    """The program is this Python that says that it is another one."""
+    says = f"import sys; sys.version_info = ({version.replace('.', ', ')})"
+    other = f'if [ "$1" = --version ]; then echo "Python {version}"; else exec {sys.executable} -c "{says}; $2"; fi'
+    done = attempt(tmp_path, DEMO, python3=other)
     assert done.returncode == 1
-    assert "needs Python 3.11 or newer; found Python 3.10.12" in done.stderr
+    assert done.stderr.count("\n") == 1 and f"needs Python 3.11 to 3.14; found Python {version}." in done.stderr
 
 
 def test_a_python_without_the_venv_module_is_detected(tmp_path: Path) -> None:
@@ -86,6 +90,14 @@ def test_a_python_without_the_venv_module_is_detected(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "venv module is missing" in done.stderr and "apt install python3.11-venv" in done.stderr
+
+
+def test_a_python_that_is_not_to_be_had_is_a_row_with_the_reason(tmp_path: Path) -> None:
+    tools = {name: f'exec {shutil.which(name)} "$@"' for name in ("mkdir", "date")}
+    done = attempt(tmp_path, "sh scripts/pythons 3.12 3.14", **tools, id="echo 1000")
+    assert done.returncode == 0, done.stderr
+    assert "| 3.12 | not to be had here: no python3.12 with venv on the PATH | | | |\n" in done.stdout
+    assert "python3.14 with venv on the PATH, and no root rights or no debootstrap for sid |" in done.stdout
 
 
 def test_commands_and_options_in_the_readme_exist() -> None:

@@ -51,7 +51,10 @@ def state_of(model: StoredModel) -> State:
 
 def _readable(folder: Path) -> None:
     try:
-        if folder.exists():
-            next(folder.iterdir(), None)
+        try:
+            folder.stat()  # exists() hides a lack of permission since Python 3.14
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        next(folder.iterdir(), None)
     except OSError as error:
         raise ModelError(f"{folder}: cannot be read ({error.strerror}); choose another --folder") from None

@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -197,3 +198,16 @@ def test_a_blank_file_digest_is_accepted_and_a_missing_one_is_not(package: Path)
     package.write_bytes(whole[:at] + bytes(len(EMPTY_DIGEST)) + whole[at + len(EMPTY_DIGEST) :])
     with pytest.raises(MapError, match="altered since it was built"):
         MapPackage.open(package, verify=True)
+
+
+def test_a_package_is_closed_with_the_last_of_its_views_whatever_thread_opened_it(package: Path) -> None:
+    with ThreadPoolExecutor(1) as other:
+        opened = other.submit(MapPackage.open, package).result()
+    database, (west, south, east, north) = opened._db, opened.manifest.bounds_wgs84
+    elevation = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2)).elevation
+    del opened
+    assert elevation(np.zeros(1), np.zeros(1)) is None, "a map without elevation, which is open"
+    database.execute("SELECT 1")
+    del elevation
+    with pytest.raises(sqlite3.ProgrammingError, match="closed"):
+        database.execute("SELECT 1")

@@ -4,6 +4,7 @@ import gzip
 import mmap
 import sqlite3
 import struct
+import weakref
 import zlib
 from functools import lru_cache
 from pathlib import Path
@@ -38,6 +39,7 @@ class MbtilesReader:
             raise MapError(f"{path}: no such file; check the path of the source")
         try:
             self._db = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)
+            self._close = weakref.finalize(self, self._db.close)  # also of a file that is refused below
             rows = self._db.execute("SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level").fetchall()
         except sqlite3.DatabaseError as error:
             raise MapError(f"{path}: not an MBTiles file ({error}); check the source") from None
@@ -63,7 +65,7 @@ class MbtilesReader:
         return bytes(found[0]) if found else b""
 
     def close(self) -> None:
-        self._db.close()
+        self._close()
 
 
 class PmtilesReader:

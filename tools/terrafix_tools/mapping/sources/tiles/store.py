@@ -5,6 +5,7 @@ Every tile is a transaction of its own in write-ahead mode, so that a killed pro
 import sqlite3
 import threading
 import time
+import weakref
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -38,6 +39,7 @@ class TileStore:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=BUSY_S)
+            self._close = weakref.finalize(self, self._db.close)  # also of a store that is refused below
             self._db.execute("PRAGMA journal_mode = WAL")
             self._db.execute("PRAGMA synchronous = NORMAL")
             self._db.executescript(SCHEMA)
@@ -53,7 +55,7 @@ class TileStore:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._db.close()
+        self._close()
 
     def add(self, tile: Tile, data: bytes | None) -> None:
         """Stores a tile; None: absent on the server. Raises OutputError when the disk is full."""
