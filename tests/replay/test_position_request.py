@@ -9,6 +9,7 @@ import pytest
 import rasterio
 from rasterio.warp import transform
 
+from terrafix.core.geodesy import LocalFrame
 from terrafix.core.log_lines import MessageLog
 from terrafix.core.node import Node, NodeContext
 from terrafix.link.node import LinkNode
@@ -20,6 +21,7 @@ EVERY, FRAMES = 2, 200  # of the recorded frames every second one is flown, up t
 BLANK, BLANK_M = range(60, 150), 90.0  # recorded frames around which the map has no imagery, and radius there
 MAX_SPEED_MPS = 12.0  # of the flight
 HINT_OFF_M, HINT_RADIUS_M = 60.0, 150.0
+DRIFT_M = 100.0  # between two map fixes, AC-11
 
 pytestmark = pytest.mark.slow
 
@@ -34,6 +36,12 @@ def way_m(places: list[tuple[float, float]]) -> float:
     """Length of a path through (latitude, longitude) in degrees."""
     lat, lon = np.array(places).T * 111_000.0
     return float(np.hypot(np.diff(lat), np.diff(lon) * np.cos(np.radians(places[0][0]))).sum())
+
+
+def errors_m(rows: list[dict[str, str]], truth: list[tuple[float, float]]) -> np.ndarray:
+    """East and north (N, 2) of the immediate positions."""
+    places = [(float(row["lat_deg"]), float(row["lon_deg"])) for row in rows]
+    return np.array([LocalFrame(*true).to_local(*at) for at, true in zip(places, truth[:FRAMES:EVERY], strict=True)])
 
 
 def thinned_flight(flight: Path, folder: Path) -> Path:
@@ -118,5 +126,11 @@ def test_after_a_fifth_of_the_route_without_a_fix_the_operator_is_asked_and_the_
     entries = [MessageLog().entry(text) for _, text in operator.asked]
     assert all(entry is not None and entry.level == "warning" and "hint" in entry.fields["text"] for entry in entries)
     assert operator.verdicts and {v.verdict for v in operator.verdicts} == {Verdict.ACCEPTED}
+    off_m = errors_m(rows, truth)
+    # The drift over 600 m without a fix hangs on a few tracks: 7 m with one processor's kernels, 39 m with another's.
+    # AC-11 allows 100 m. What the hint does does not hang on it: it is 60 m off, and the position hardly moves.
+    assert np.hypot(*off_m[fixed].T).max() < 20.0 and np.hypot(*off_m.T).max() < DRIFT_M
+    for frame, _ in operator.asked:
+        assert np.hypot(*(off_m[frame + 1] - off_m[frame])) < 0.1 * HINT_OFF_M
     result = evaluate(tmp_path / "out", flight / "truth.csv")
-    assert result["within_20m"] == 1.0 and result["false_fixes"] == 0 and result["ellipse95_coverage"] == 1.0
+    assert result["false_fixes"] == 0 and result["ellipse95_coverage"] == 1.0

@@ -7,41 +7,62 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from terrafix_tools.accept.fly import Job, fly
-from terrafix_tools.accept.generated import make
 from terrafix_tools.accept.measuring.results import JudgedRow, Verdict
 
-COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "accept"]
+FRAMES = 60  # of each flight, half of those of --quick
+SHORT = (
+    f"from terrafix_tools.accept import run; run.QUICK_FRAMES = {FRAMES}; from terrafix_tools.cli import main; main()"
+)
+COMMAND = [sys.executable, "-c", SHORT, "accept"]
 SCENARIOS = ("baseline", "foreign frame", "350 m outlier fix")
 
 
-@pytest.mark.slow
-def test_a_killed_acceptance_run_is_resumed_without_repeating_finished_scenarios(tmp_path: Path) -> None:
-    out = tmp_path / "accept"
+@dataclass(frozen=True)
+class Resumed:
+    """A run that was killed after its first scenario, and resumed. ``finished``, ``kept``: times of the results that
+    were there before the kill, then and at the end [ns]."""
+
+    out: Path
+    finished: dict[Path, int]
+    kept: dict[Path, int]
+    done: subprocess.CompletedProcess[str]
+
+
+@pytest.fixture(scope="module")
+def resumed(tmp_path_factory: pytest.TempPathFactory) -> Resumed:
+    """Its ground is that of all tests here."""
+    out = tmp_path_factory.mktemp("resumed") / "accept"
     command = [*COMMAND, "--quick", "--out", str(out), *(part for name in SCENARIOS for part in ("--scenario", name))]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True) as running:
         deadline_s = time.monotonic() + 1200.0
         while not list(out.glob("*/result.json")):
             assert time.monotonic() < deadline_s and running.poll() is None, "no scenario has finished"
-            time.sleep(0.5)
+            time.sleep(0.1)
         os.killpg(running.pid, signal.SIGKILL)
     finished = {path: path.stat().st_mtime_ns for path in out.glob("*/result.json")}
     done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=1200)
-    assert {path: path.stat().st_mtime_ns for path in finished} == finished  # finished scenarios are not run again
-    table = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
+    return Resumed(out, finished, {path: path.stat().st_mtime_ns for path in finished}, done)
+
+
+@pytest.mark.slow
+def test_a_killed_acceptance_run_is_resumed_without_repeating_finished_scenarios(resumed: Resumed) -> None:
+    assert resumed.finished and resumed.kept == resumed.finished  # finished scenarios are not run again
+    table = json.loads((resumed.out / "acceptance.json").read_text(encoding="utf-8"))
     assert [result["scenario"] for result in table["results"]] == list(SCENARIOS)
-    assert done.returncode == (1 if table["broken"] else 0), done.stderr
+    assert resumed.done.returncode == (1 if table["broken"] else 0), resumed.done.stderr
     rows = {(row["scenario"], row["what"]): row for row in table["rows"]}
     for name in SCENARIOS:
         assert rows[name, "frames within 50 m"]["verdict"] == "pass"
         assert rows[name, "frames wrong by over 50 m and sure of it"]["measured"] == 0.0
     assert rows["foreign frame", "wrong frames or fixes rejected"]["measured"] == 1.0
     assert rows["350 m outlier fix", "wrong frames or fixes rejected"]["measured"] == 1.0
-    page = (out / "acceptance.html").read_text(encoding="utf-8")
+    page = (resumed.out / "acceptance.html").read_text(encoding="utf-8")
     assert page.count("<figure") == len(SCENARIOS) and not re.search(r'(src|href)="', page)
 
 
@@ -54,13 +75,17 @@ def test_an_unknown_scenario_is_a_usage_error_of_one_line(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_shifted_map_is_generated_flown_and_evaluated_with_the_rows_of_false_inputs(tmp_path: Path) -> None:
+def test_a_shifted_map_is_generated_flown_and_evaluated_with_the_rows_of_false_inputs(
+    resumed: Resumed, tmp_path: Path
+) -> None:
     out = tmp_path / "accept"
+    out.mkdir()
+    (out / "ground").symlink_to(resumed.out / "ground")
     command = [*COMMAND, "--quick", "--workers", "1", "--out", str(out), "--scenario", "map shifted by 300 m"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
     table = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
     (result,) = table["results"]
-    assert result["frames"] == 90 and result["nees"] == []  # no frame has true inputs
+    assert result["frames"] == FRAMES and result["nees"] == []  # no frame has true inputs
     rows = {row["what"]: row for row in table["rows"]}
     # The map really is shifted: only the frames that the start position determines are near the truth.
     assert rows["frames within 20 m, shown only"]["measured"] < 0.3
@@ -73,9 +98,10 @@ def test_a_shifted_map_is_generated_flown_and_evaluated_with_the_rows_of_false_i
 
 
 @pytest.mark.slow
-def test_a_frozen_camera_during_a_gnss_jam_does_not_move_the_aircraft_off_its_path(tmp_path: Path) -> None:
-    ground, out = tmp_path / "ground", tmp_path / "out"
-    make("base", ground, seed=1, frames=4)  # only its map is used
+def test_a_frozen_camera_during_a_gnss_jam_does_not_move_the_aircraft_off_its_path(
+    resumed: Resumed, tmp_path: Path
+) -> None:
+    ground, out = resumed.out / "ground" / "base", tmp_path / "out"
     job = Job(
         scenario="GNSS jam, frozen picture", flight="", truth="", map=str(ground / "map.tif"), out=str(out), seed=1,
         generated=True)  # fmt: skip

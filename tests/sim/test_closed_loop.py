@@ -2,7 +2,6 @@
 
 import csv
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from terrafix.core.errors import OutputError
+from terrafix_tools.cli import app, main
 from terrafix_tools.mapping.build import build
 from terrafix_tools.sim.autopilot.parameters import Gps, Kind
 from terrafix_tools.sim.closed_loop.flight import Conditions, plan_over
@@ -19,7 +21,7 @@ from terrafix_tools.sim.flights.scene import Scene, scene_of_world
 from terrafix_tools.sim.sensors.gnss_events import Drag, Jam, Outage
 from terrafix_tools.sim.world import place as world
 
-COMMAND = [sys.executable, "-m", "terrafix_tools.cli", "sim", "fly"]
+COMMAND = ["terrafix", "sim", "fly"]
 Place = tuple[Scene, Path]
 
 
@@ -120,28 +122,32 @@ def test_the_same_seed_gives_identical_output_files(place: Place, tmp_path: Path
         (["--length-km", "1000"], 2, "--length-km 1000"),
         (["--spoof-after", "-1"], 2, "--spoof-after -1"),
         (["--image", "x.tif"], 2, "--image needs --map"),
-        pytest.param(["--mission", "{far}"], 4, "outside the world", marks=pytest.mark.slow),
+        (["--mission", "{far}"], 4, "outside the world"),
     ],
 )
 def test_an_impossible_flight_is_an_error_of_one_line(
-    arguments: list[str], code: int, expected: str, tmp_path: Path
+    arguments: list[str],
+    code: int,
+    expected: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     far = tmp_path / "far.waypoints"
     row = "\t0\t3\t16\t0\t0\t0\t0\t"
     far.write_text(f"QGC WPL 110\n0{row}47.0\t8.0\t0\t1\n1{row}47.1\t8.0\t100\t1\n")
     filled = [part.replace("{far}", str(far)) for part in arguments]
-    done = subprocess.run(
-        [*COMMAND, "--out", str(tmp_path / "out"), *filled], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == code, done.stderr
-    assert done.stderr.strip().count("\n") == 0
-    assert expected in done.stderr
+    monkeypatch.setattr(sys, "argv", [*COMMAND, "--out", str(tmp_path / "out"), *filled])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    printed = capsys.readouterr().err
+    assert ended.value.code == code, printed
+    assert printed.strip().count("\n") == 0
+    assert expected in printed
 
 
-@pytest.mark.slow
 def test_sim_fly_does_not_write_into_a_foreign_folder(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
-    done = subprocess.run([*COMMAND, "--out", str(tmp_path)], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 6
-    assert "not made by fly" in done.stderr
+    refused = CliRunner().invoke(app, ["sim", "fly", "--out", str(tmp_path)])
+    assert isinstance(refused.exception, OutputError) and "not made by fly" in str(refused.exception)
     assert (tmp_path / "thesis.txt").read_text() == "precious"

@@ -1,5 +1,7 @@
 """Height scale of a camera with a wrong focal length: estimated from climbs, and consistent without a map."""
 
+from functools import cache
+
 import gtsam
 import msgspec
 import numpy as np
@@ -30,6 +32,7 @@ def seen_through(message: Message, focal: float) -> Message:
     return message
 
 
+@cache
 def flown(focal: float, *, dem: bool, seed: int) -> tuple[Flight, EstimatorRun]:
     flight, run = Flight(FRAMES, seed=seed, dem=dem, climb_amplitude_m=40.0), EstimatorRun()
     run.feed([UNCALIBRATED])

@@ -117,7 +117,7 @@ place = world.generate(3, width_m=10_000.0, height_m=10_000.0)
 ground = place.ground("autumn", LocalFrame(*place.wgs84(5000.0, 5000.0)))
 camera = m.Camera(width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5)
 renderer = Renderer(ground, camera)
-for index, at_m in enumerate(np.arange(-4800.0, 4800.0, 200.0)):
+for index, at_m in enumerate(np.arange(-4800.0, 4801.0, 800.0)):
     renderer.frame(np.array([at_m, 0.7 * at_m, 520.0]), np.diag([1.0, -1.0, -1.0]), index)
 # Not ru_maxrss, which includes the parent process.
 print(int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) // 1024)

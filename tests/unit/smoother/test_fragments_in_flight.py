@@ -13,6 +13,7 @@ from terrafix.smoother.node import SmootherNode
 
 FRAMES = 240
 FRAGMENTS = (range(72), range(87, 150), range(165, FRAMES))
+SEED = 4  # of the flight that most tests read
 MAPPED = 12  # last frames of each fragment, over ground that the map shows
 
 
@@ -69,7 +70,7 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def flown() -> Flown:
-    return Flown(4)
+    return Flown(SEED)
 
 
 def test_three_fragments_are_anchored_and_their_past_is_refined_within_five_seconds_of_the_last_anchor(
@@ -92,6 +93,6 @@ def test_the_refined_past_of_all_fragments_is_right_to_five_metres_in_the_median
 
 
 @pytest.mark.slow
-def test_the_covariance_of_refined_poses_holds_over_many_flights() -> None:
-    nees = np.concatenate([Flown(seed).nees() for seed in range(6)])
+def test_the_covariance_of_refined_poses_holds_over_many_flights(flown: Flown) -> None:
+    nees = np.concatenate([flown.nees(), *(Flown(seed).nees() for seed in range(6) if seed != SEED)])
     assert float(np.mean(nees < 5.991)) >= 0.93 and 0.3 < float(np.mean(nees)) < 2.6

@@ -26,7 +26,9 @@ def line(from_m: tuple[float, float], to_m: tuple[float, float], yaw_deg: float,
 OUT = line((0.0, -300.0), (0.0, 300.0), 0.0)
 ASIDE = line((0.0, 300.0), (400.0, 300.0), 90.0)
 BACK = line((400.0, -100.0), (-200.0, -100.0), -90.0)  # crosses the way out
-AWAY = line((400.0, 300.0), (400.0, -600.0), 180.0)
+AWAY = line((400.0, 300.0), (400.0, -100.0), 180.0)
+BEYOND = line((-200.0, -100.0), (-200.0, -600.0), 180.0)
+CROSSING = range(len(OUT + ASIDE + AWAY), len(OUT + ASIDE + AWAY + BACK))  # frames of BACK
 
 
 class Flown:
@@ -67,9 +69,14 @@ class Flown:
         return [m.fragment_id for m in self.published if isinstance(m, Odometry)]
 
 
-def test_a_crossing_of_the_old_track_at_another_heading_is_found_with_its_motion(ground: np.ndarray) -> None:
-    run = Flown(ground).fly(OUT + ASIDE + AWAY[:20] + BACK)
-    crossing = [m for m in run.found() if m.frame_id >= len(OUT + ASIDE) + 20]
+@pytest.fixture(scope="module")
+def crossed(ground: np.ndarray) -> Flown:
+    return Flown(ground).fly(OUT + ASIDE + AWAY + BACK + BEYOND)
+
+
+def test_a_crossing_of_the_old_track_at_another_heading_is_found_with_its_motion(crossed: Flown) -> None:
+    run = crossed
+    crossing = [m for m in run.found() if m.frame_id in CROSSING]
     assert crossing
     for m in crossing:
         pairs = np.array(m.two_view)
@@ -82,9 +89,8 @@ def test_a_crossing_of_the_old_track_at_another_heading_is_found_with_its_motion
         assert m.t_ns == m.frame_id * 1_000_000_000
 
 
-def test_ground_that_was_not_seen_before_is_never_relocalised(ground: np.ndarray) -> None:
-    run = Flown(ground).fly(OUT + ASIDE + AWAY)
-    assert run.found() == []
+def test_ground_that_was_not_seen_before_is_never_relocalised(crossed: Flown) -> None:
+    assert [m for m in crossed.found() if m.frame_id not in CROSSING] == []
 
 
 def test_a_new_fragment_is_connected_to_an_old_one_over_the_same_ground(ground: np.ndarray) -> None:
@@ -120,19 +126,17 @@ def test_at_most_one_search_a_second(ground: np.ndarray, monkeypatch: pytest.Mon
     assert 1 <= len(searched) <= 5  # 18 keyframes in 4.5 s
 
 
-@pytest.mark.parametrize(("error", "searches"), [(OVERTAKEN, False), ("broken JPEG", True)])
-def test_while_frames_are_dropped_nothing_is_searched(ground: np.ndarray, error: str, searches: bool) -> None:
-    run = Flown(ground).fly(OUT + ASIDE + AWAY[:20])
-    before = len(run.found())
-    run.fly(BACK, error=error)
-    assert (len(run.found()) > before) is searches
+def test_while_frames_are_dropped_nothing_is_searched(ground: np.ndarray) -> None:
+    """Not while newer frames come before older ones are done; frames that are broken do not matter."""
+    run = Flown(ground).fly(OUT[:15] + line((0.0, 0.0), (400.0, 0.0), 90.0) + AWAY[15:])
+    assert run.fly(BACK, error=OVERTAKEN).found() == []
+    assert run.fly(BACK[::-1], error="broken JPEG").found() != []
 
 
-def test_odometry_is_published_before_the_search(ground: np.ndarray) -> None:
-    run = Flown(ground).fly(OUT + ASIDE + AWAY[:20] + BACK)
-    for m in run.found():
-        at = run.published.index(m)
-        before = run.published[at - 1]
+def test_odometry_is_published_before_the_search(crossed: Flown) -> None:
+    for m in crossed.found():
+        at = crossed.published.index(m)
+        before = crossed.published[at - 1]
         assert isinstance(before, Odometry) and before.frame_id == m.frame_id
 
 

@@ -27,7 +27,7 @@ from terrafix_tools.sim.closed_loop.flight import FRAME_HZ as LOOP_HZ
 from terrafix_tools.sim.closed_loop.flight import Conditions, plan_over
 from terrafix_tools.sim.closed_loop.loop import Plan, fly
 from terrafix_tools.sim.flights.folder import FRAME_HZ
-from terrafix_tools.sim.flights.scene import scene_of_world
+from terrafix_tools.sim.flights.scene import Scene, scene_of_world
 from terrafix_tools.sim.interfaces import State
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Jam
 from terrafix_tools.sim.world import place as world
@@ -54,7 +54,7 @@ def fly_closed(
     if scenario in LIES_IN_THE_LOOP:
         return _fly_with_lie(scenario, package, out, seed=seed, frames=frames, truth_offset_m=truth_offset_m)
     event, text = EVENTS[scenario]
-    plan = _plan(package, (event,), LOOP_HZ, seed=seed, frames=frames)
+    plan = _plan(_scene(seed), package, (event,), LOOP_HZ, seed=seed, frames=frames)
     fly(plan, out)
     zero_s = read_rows(out / ESTIMATES)[0].t_s  # the first frame is taken at the start
     marks = Marks(spans=(Span(zero_s + AFTER_S, zero_s + plan.duration_s, text),))
@@ -65,23 +65,30 @@ def _fly_with_lie(
     scenario: str, package: Path, out: Path, *, seed: int, frames: int, truth_offset_m: tuple[float, float]
 ) -> Evidence:
     """With a reference flight first: on GNSS only, without a camera and without the false input."""
+    scene = _scene(seed)
     fly(
-        replace(_plan(package, (), FRAME_HZ, seed=seed, frames=frames), view=lambda _state, _index: None),
+        replace(_plan(scene, package, (), FRAME_HZ, seed=seed, frames=frames), view=lambda _state, _index: None),
         out / WITHOUT_LIE,
     )
-    plan = _plan(package, (Jam(start_s=AFTER_S),), FRAME_HZ, seed=seed, frames=frames)
+    plan = _plan(scene, package, (Jam(start_s=AFTER_S),), FRAME_HZ, seed=seed, frames=frames)
     fly(replace(plan, view=EditedCamera(plan.view, LIES_IN_THE_LOOP[scenario](LIE))), out)
     evidence = _gathered(out, Marks(spans=(LIE,), lie=LIE), truth_offset_m)
     evidence.sent = sent_fixes(out, out / WITHOUT_LIE, plan.frame)
     return evidence
 
 
-def _plan(package: Path, events: tuple[AnyEvent, ...], frame_hz: float, *, seed: int, frames: int) -> Plan:
-    """``frames``: gives the duration, as of a recorded flight."""
+def _scene(seed: int) -> Scene:
     place = world.generate(seed)
+    return scene_of_world(place, place.render(KINDS["base"].looks[1]))
+
+
+def _plan(
+    scene: Scene, package: Path, events: tuple[AnyEvent, ...], frame_hz: float, *, seed: int, frames: int
+) -> Plan:
+    """``frames``: gives the duration, as of a recorded flight."""
     duration_s = frames / FRAME_HZ
     return plan_over(
-        scene_of_world(place, place.render(KINDS["base"].looks[1])),
+        scene,
         package,
         seed=seed,
         length_m=SPEED_MPS * duration_s,

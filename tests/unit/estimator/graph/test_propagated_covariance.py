@@ -82,12 +82,27 @@ class Tree:
         keys = gtsam.KeyVector([C(node), B(node), V(node)])
         return np.asarray(gtsam.Marginals(self.graph, values).jointMarginalCovariance(keys).fullMatrix())
 
+    def rounding(self) -> float:
+        """What rounding may do to a covariance, as a share of the two sigmas of its row and column: the condition of
+        the information matrix, whose inverse the marginals are, with a diagonal of ones."""
+        information = self.graph.linearize(values_of({n: self.states[n] for n in self.states})).hessian()[0]
+        root = np.sqrt(np.diag(information))
+        return float(np.finfo(float).eps * np.linalg.cond(information / np.outer(root, root)))
+
+    def assert_propagated_as_in_the_graph(self) -> None:
+        rounding = self.rounding()
+        assert rounding < 1e-8  # otherwise the comparison shows nothing
+        for node in self.states:
+            marginal = self.marginal(node)
+            sigmas = np.sqrt(np.diag(marginal))
+            off = np.abs(self.propagated[node] - marginal) / np.outer(sigmas, sigmas)
+            assert off.max() < rounding, f"node {node}"
+
 
 @pytest.mark.parametrize("seed", range(3))
 def test_propagation_gives_the_marginal_of_every_node(seed: int) -> None:
     tree = Tree(seed)
-    for node in tree.states:
-        assert tree.propagated[node] == pytest.approx(tree.marginal(node), rel=1e-6, abs=1e-8), f"node {node}"
+    tree.assert_propagated_as_in_the_graph()
 
 
 @pytest.mark.parametrize("measured", [0, 2, 3, 6])
@@ -97,8 +112,8 @@ def test_measurements_change_the_covariance_of_all_joined_nodes_as_in_the_graph(
     tree.fuse(measured, tree.prior(C, measured, tree.cov(POSE_SIZE)))
     tree.fuse(5, tree.attitude(5))
     tree.fuse(measured, tree.attitude(measured))
+    tree.assert_propagated_as_in_the_graph()
     for node in tree.states:
-        assert tree.propagated[node] == pytest.approx(tree.marginal(node), rel=1e-6, abs=1e-8), f"node {node}"
         assert np.array_equal(tree.propagated[node], tree.propagated[node].T)
 
 
@@ -118,8 +133,7 @@ def test_what_a_new_node_tells_of_its_parent_improves_all_joined_nodes() -> None
     tree.propagated.extend(7, 6, factors, tree.states)
     tree.add(factors)
     tree.fuse(3, tree.attitude(3))
-    for node in tree.states:
-        assert tree.propagated[node] == pytest.approx(tree.marginal(node), rel=1e-6, abs=1e-8), f"node {node}"
+    tree.assert_propagated_as_in_the_graph()
     for node, cov in before.items():
         assert np.linalg.slogdet(tree.propagated[node])[1] < np.linalg.slogdet(cov)[1]
 
