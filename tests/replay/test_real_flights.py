@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.evaluate import evaluate
-from terrafix_tools.finalise.run import finalise
+from terrafix_tools.evaluate import evaluate, truth_sigma_of
+from terrafix_tools.finalise.batch_smoother import smooth
+from terrafix_tools.finalise.run import finalise, flights_of
 from terrafix_tools.replay import replay
 
 pytestmark = pytest.mark.slow
@@ -25,7 +26,9 @@ HALF = 180  # frames of village-1, of 358; town-a has fewer
 NAMES = ("village-1", "town-a")
 MAPS = {"village-1": "village-2014-01.tif", "town-a": "town.tif"}
 PEAK_MEMORY_MB = 1024.0
-PROCESSORS_M = 0.35  # change of the difference of two median errors between processors
+FRAMES_OF_A_RUN = 10  # whose errors count as one number: they lie over the same ground
+SIGNIFICANT = 2.0  # standard errors of a difference between two tracks
+CLEARLY = 5.0  # ... beyond any quantile that few runs of matches may need
 # 2.5 % quantile of chi-square with 2 degrees of freedom: the least mean NEES of a flight with one independent error
 LEAST_NEES_OF_ONE_DRAW = 0.0506
 AC_9_REGISTERED = 0.95  # share of the frames that odometry is required to register
@@ -76,15 +79,38 @@ def short_flight(flight: Path, folder: Path, frames: int) -> Path:
     return folder
 
 
-def scatter_m(flight: Path, rows: list[dict[str, str]], prefix: str = "") -> float:
-    """-> median distance of the errors from their median: without the error of the map, which is common to all."""
+def errors_m(flight: Path, rows: list[dict[str, str]], prefix: str = "") -> np.ndarray:
+    """-> (N, 2) error of each row, east and north."""
     truth = {r["file"]: r for r in csv.DictReader((flight / "truth.csv").read_text(encoding="utf-8").splitlines())}
-    errors_m = []
+    found = []
     for row in rows:
         true = truth[row["file"]]
         frame = LocalFrame(float(true["lat_deg"]), float(true["lon_deg"]))
-        errors_m.append(frame.to_local(float(row[f"{prefix}lat_deg"]), float(row[f"{prefix}lon_deg"])))
-    return float(np.median(np.hypot(*(np.array(errors_m) - np.median(errors_m, axis=0)).T)))
+        found.append(frame.to_local(float(row[f"{prefix}lat_deg"]), float(row[f"{prefix}lon_deg"])))
+    return np.array(found)
+
+
+def scatter_m(flight: Path, rows: list[dict[str, str]], prefix: str = "") -> float:
+    """-> median distance of the errors from their median: without the error of the map, which is common to all."""
+    found = errors_m(flight, rows, prefix)
+    return float(np.median(np.hypot(*(found - np.median(found, axis=0)).T)))
+
+
+def farther_sigmas(flights: list[tuple[np.ndarray, np.ndarray, float]]) -> float:
+    """How much farther from the truth the second track of each flight is than the first, over all flights together, in
+    standard errors. ``flights``: errors (N, 2) of both, and the 1-sigma of the truth [m].
+
+    A standard error is the scatter of the difference from run to run, and what the truth does not tell: an error of the
+    truth that is common to the flight changes both distances, by the part of the shift between the tracks along it."""
+    more_m, variance_m2 = 0.0, 0.0
+    for first, second, truth_sigma_m in flights:
+        difference_m = np.hypot(*second.T) - np.hypot(*first.T)
+        runs = np.array([np.mean(run) for run in np.array_split(difference_m, max(len(first) // FRAMES_OF_A_RUN, 2))])
+        shift_m = float(np.hypot(*(second - first).mean(axis=0)))
+        common_m = max(float(np.hypot(*first.mean(axis=0))), truth_sigma_m)
+        more_m += float(difference_m.mean())
+        variance_m2 += float(np.var(runs, ddof=1)) / len(runs) + 0.5 * (shift_m * truth_sigma_m / common_m) ** 2
+    return more_m / float(np.sqrt(variance_m2))
 
 
 def check_floors(result: dict[str, Any], flight: Path, out: Path) -> None:
@@ -109,20 +135,26 @@ def check_floors(result: dict[str, Any], flight: Path, out: Path) -> None:
     assert result["refined"] / frames > 0.80
 
 
-def check_finalised(flight: Path, out: Path, refined_median_m: float) -> None:
-    """The finalised track is not worse than the positions refined in flight, and its covariance is consistent."""
-    finalise(out)
+def check_finalised(flight: Path, out: Path) -> None:
+    """What is kept of the batch solution is consistent, and it is the refined track where held-out map matches do not
+    say that it is better."""
+    summary = finalise(out)
     result = evaluate(out, flight / "truth.csv")
     assert result["finalised"] == result["frames"]
-    rows = list(csv.DictReader((out / "finalised.csv").read_text(encoding="utf-8").splitlines()))
-    # As in check_floors. Five runs of town-a with starts that differ by 0.1 m to the north: the ratio is 0.98 to 1.10;
-    # it was 0.93 to 1.12 without the lens calibration.
-    assert scatter_m(flight, rows) <= 1.15 * scatter_m(flight, rows_of(out), "refined_")
-    # The same record on two processors (other BLAS kernels, other rounding): refined 2.70 and 2.57 m, finalised 2.7 and
-    # 2.9 m. Such differences are not significant with a truth of 7 m accuracy.
-    assert len(rows) < FEW_FRAMES or result["finalised_median_m"] <= 1.05 * refined_median_m + PROCESSORS_M
     assert result["finalised_within_20m"] >= result["refined_within_20m"]
     assert result["finalised_false_fixes"] == 0 and result["finalised_ellipse95_coverage"] >= 0.90
+    (found,) = summary["flights"]
+    focal, lens, track = found["before_after"][0], found["held_out"]["lens"], found["held_out"]["track"]
+    if focal["before"] == focal["after"]:
+        assert lens is None or lens["after"] > lens["before"]
+    else:
+        assert lens["sigmas"] < CLEARLY
+    if found["solution"] == "refined":
+        assert track["sigmas"] > -CLEARLY
+        rows = list(csv.DictReader((out / "finalised.csv").read_text(encoding="utf-8").splitlines()))
+        assert np.abs(errors_m(flight, rows) - errors_m(flight, rows_of(out), "refined_")).max() < 0.01
+    else:
+        assert track["after"] < track["before"]
 
 
 def check_none_unlocalised_after_the_first_anchor(out: Path) -> None:
@@ -136,7 +168,7 @@ def check_without_weights(name: str, fly: Fly) -> float:
     flight, out, result = fly(name, MAPS[name])
     check_floors(result, flight, out)
     check_none_unlocalised_after_the_first_anchor(out)
-    check_finalised(flight, out, result["refined_median_m"])
+    check_finalised(flight, out)
     return float(result["odometry_rate"])
 
 
@@ -148,6 +180,29 @@ def test_town_a_meets_the_limits_and_ac_9_without_weights(fly: Fly) -> None:
     """Photos with 55 % overlap along a line, and a survey of several lines. One of 30 shows no ground of another
     before it."""
     assert check_without_weights("town-a", fly) >= AC_9_REGISTERED
+
+
+def test_the_batch_solution_is_no_farther_from_the_truth_than_refined_positions_over_the_flights_together(
+    fly: Fly,
+) -> None:
+    """Whether or not it is kept, with the lens as described."""
+    flights = []
+    for name in NAMES:
+        flight, out, _ = fly(name, MAPS[name])
+        (graph,) = flights_of(out)
+        solved = smooth(graph, estimates_lens=False)
+        axes = LocalFrame(graph.origin.lat_deg, graph.origin.lon_deg)
+        rows = rows_of(out)
+        for frame_id, row in enumerate(rows):
+            at_m = solved.poses[graph.node_of[frame_id]].translation()
+            row["lat_deg"], row["lon_deg"] = map(str, axes.to_wgs84(float(at_m[0]), float(at_m[1])))
+        truth_sigma_m = truth_sigma_of(flight / "truth.csv")
+        assert truth_sigma_m is not None
+        flights.append((errors_m(flight, rows, "refined_"), errors_m(flight, rows), truth_sigma_m))
+    assert farther_sigmas(flights) < SIGNIFICANT
+    rng = np.random.default_rng(1)
+    noisy = [(refined, refined + rng.normal(0.0, 4.0, refined.shape), sigma) for refined, _, sigma in flights]
+    assert farther_sigmas(noisy) > SIGNIFICANT  # the comparison would show it
 
 
 @pytest.mark.parametrize("name", NAMES)

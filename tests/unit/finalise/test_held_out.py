@@ -12,11 +12,11 @@ from simulated_flight import Flight, t_ns
 from terrafix.messages import Frame, MapMatch, Message, Refinement, SourceEnded
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.before_after import kept_line
-from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
+from terrafix_tools.finalise.flight_graph import HELD_OUT_RUN, FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, Comparison, choose
 from terrafix_tools.finalise.run import finalise, last_lines
 
-MATCHES = 60
+MATCHES = 160
 KEYFRAME, AGAIN = 57, (100, 101, 102)  # frames: of a keyframe, and those that see its ground again
 
 
@@ -38,15 +38,15 @@ def test_a_difference_counts_when_it_is_large_against_the_scatter_of_the_flight(
 
 
 def test_a_difference_between_few_matches_decides_nothing() -> None:
-    for matches in (0, 5, 9):
+    for matches in (0, HELD_OUT_RUN, 3 * HELD_OUT_RUN):
         found = compared(-2.0, matches)
         assert not found.better and not found.worse and found.matches == matches
 
 
 def test_four_runs_of_matches_need_a_larger_difference_than_forty() -> None:
-    """Student's t: 97.7 % of 3 and of 39 degrees of freedom, from the tables."""
-    assert compared(0.0, 12)._limit == pytest.approx(3.31, rel=0.03)
-    assert compared(0.0, 120)._limit == pytest.approx(2.07, rel=0.01)
+    """Student's t: 95 % of 3 and of 39 degrees of freedom, from the tables."""
+    assert compared(0.0, 4 * HELD_OUT_RUN)._limit == pytest.approx(2.353, rel=0.03)
+    assert compared(0.0, 40 * HELD_OUT_RUN)._limit == pytest.approx(1.685, rel=0.01)
 
 
 def test_a_wrong_match_does_not_decide_which_solution_is_better() -> None:
@@ -57,14 +57,16 @@ def test_a_wrong_match_does_not_decide_which_solution_is_better() -> None:
     assert Comparison.of(before, after, "m").better
 
 
-def test_every_third_map_match_is_held_out_and_never_reaches_the_estimator() -> None:
+def test_every_third_run_of_map_matches_is_held_out_and_never_reaches_the_estimator() -> None:
     flight = Flight(60, seed=2, fix_every=2)
     replayer = FlightReplayer(EVERY)
     for message in messages(flight):
         replayer.on(message)
     (graph,) = replayer.flights
     whole = replayed_graph(flight)
-    assert len(graph.held_out) == len(whole.fixes) // EVERY and not whole.held_out
+    runs, rest = divmod(len(whole.fixes), HELD_OUT_RUN)
+    assert len(graph.held_out) == (runs // EVERY) * HELD_OUT_RUN + (rest if runs % EVERY == EVERY - 1 else 0)
+    assert graph.held_out and not whole.held_out
     assert len(graph.fixes) + len(graph.held_out) == len(whole.fixes)
     assert not {fix.node for fix in graph.held_out} & {fix.node for fix in graph.fixes}
 

@@ -40,6 +40,9 @@ from terrafix_tools.finalise.map_points import MatchedPoints
 from terrafix_tools.finalise.point_cloud import FeatureTracks
 
 SAME_FRAME_M, SAME_FRAME_MPS = 0.01, 0.01  # 1-sigma (m and rad; m/s) between two nodes of one frame
+# Successive map matches that are held out together, and whose errors count as one number: they lie over the same
+# ground, with the same error of the map, which a track follows that was given their neighbours. [tuned]
+HELD_OUT_RUN = 8
 SAME_FRAME_WALK = 0.01  # share of one second's random walk of B between these
 
 
@@ -213,8 +216,8 @@ class RecordedEstimator(Estimator):
 
 class FlightReplayer:
     """Feeds a record, message after message, to the node that flew. ``flights``: one for each Origin, and each
-    InitialPosition, from which its estimator began; ``estimators``: those of them. ``hold_out_every``: of the map
-    matches with a pose, one in so many is held out; 0: none."""
+    InitialPosition, from which its estimator began; ``estimators``: those of them. ``hold_out_every``: of the runs of
+    HELD_OUT_RUN map matches with a pose, one in so many is held out; 0: none."""
 
     def __init__(self, hold_out_every: int = 0) -> None:
         self.flights: list[FlightGraph] = []
@@ -249,12 +252,12 @@ class FlightReplayer:
         return published
 
     def _holds_out(self, match: MapMatch) -> bool:
-        """Counts the matches with a pose, and holds out one in ``hold_out_every``, whose frame has a node."""
+        """Counts the matches with a pose, and holds out one run in ``hold_out_every``, where its frames have nodes."""
         estimator = self.node.estimator
         if not self._hold_out_every or estimator is None or match.verdict is not Verdict.ACCEPTED:
             return False
-        self._with_pose += 1
-        fix = self._fix(match, estimator) if self._with_pose % self._hold_out_every == 0 else None
+        run, self._with_pose = self._with_pose // HELD_OUT_RUN, self._with_pose + 1
+        fix = self._fix(match, estimator) if (run + 1) % self._hold_out_every == 0 else None
         if isinstance(fix, Fix):
             self.flights[-1].held_out.append(fix)
         return isinstance(fix, Fix)

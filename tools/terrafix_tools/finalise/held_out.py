@@ -1,7 +1,7 @@
 """Which solution of a flight map matches prefer that none of them was given (cross-validation).
 
-The record is replayed once more without one in EVERY of its map matches. By the reprojection error of the points of
-these, the batch smoother's solution is compared with the last estimates in flight, and an estimated lens with the
+The record is replayed once more without one in EVERY runs of its map matches. By the reprojection error of the points
+of these, the batch smoother's solution is compared with the last estimates in flight, and an estimated lens with the
 described one. A distance of positions alone would not do: a match by itself confuses position and tilt, and the same
 error of the lens is in it as in the estimates in flight."""
 
@@ -12,15 +12,12 @@ import gtsam
 import numpy as np
 
 from terrafix_tools.finalise.batch_smoother import Progress, Smoothed, smooth
-from terrafix_tools.finalise.flight_graph import Fix, FlightGraph
+from terrafix_tools.finalise.flight_graph import HELD_OUT_RUN, Fix, FlightGraph
 from terrafix_tools.finalise.lens import Lens
 
-EVERY = 3  # of the map matches of a flight, one in so many is held out [tuned]
-# Successive held-out matches whose errors count as one number: they lie over the same ground, with the same error of
-# the map. [tuned]
-RUN = 3
+EVERY = 3  # of the runs of map matches of a flight, one in so many is held out [tuned]
 MIN_RUNS = 4  # below this the scatter of the runs is not known [tuned]
-SIGNIFICANT = 2.0  # standard errors of many runs, one-sided 2.3 % [spec: normal]
+SIGNIFICANT = 1.645  # standard errors of many runs, one-sided 5 % [spec: normal]
 OUTLIER = 4.0  # medians, to which a distance is clipped: a wrong match is equally wrong for both [tuned]
 # Share of the description's 1-sigma of the focal length, above which the flight does not determine it. [tuned]
 DETERMINED = 0.5
@@ -45,7 +42,7 @@ class Comparison:
             return cls(0, 0.0, 0.0, unit, 0, 0.0)
         limit = OUTLIER * float(np.median(before))
         before, after = np.minimum(before, limit), np.minimum(after, limit)
-        runs = len(before) // RUN
+        runs = len(before) // HELD_OUT_RUN
         sigmas = 0.0
         if runs >= MIN_RUNS:
             of_runs = np.array([np.mean(run) for run in np.array_split(after - before, runs)])
