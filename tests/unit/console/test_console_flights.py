@@ -1,8 +1,10 @@
-"""Flights over HTTP, from their first image to their completion, computed by the processes of the console."""
+"""Flights over HTTP, from their first image to their completion, computed by the processes of the console, or by a Dask
+cluster: the results and events of this computer, also when a worker dies."""
 
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,13 @@ import pytest
 from console_flight import AGL_M, CAMERA, ELSEWHERE, GROUND, distance_m, lat_lon, make_map, place_of, write_images
 from console_rig import WAIT_FOR_RESULT_S as WAIT_S
 from console_rig import Console, Served, Watched, settings
+from map_cluster import LocalCluster, local_cluster
 from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.console.payloads import NewFlight, ObjectPixel, PixelPoint, UserFix
 
 pytestmark = pytest.mark.slow  # processes, but no clock: the tests wait as long as it takes
 
+FRAMES = range(10, 20)
 KILLED_AT = 8  # event, of a flight of some 50
 NEW: dict[str, Any] = {
     "camera": {"width": 640, "height": 480, "fx": 380.0, "cx": 319.5, "cy": 239.5, "distortion": [0, 0, 0, 0]},
@@ -88,20 +92,36 @@ def stored(client: ConsoleClient, flight_id: str) -> list[Any]:
     return [results, client.flight(flight_id).fragments, events]
 
 
-def undisturbed(tmp_path: Path, maps: Path, images: list[tuple[str, Path]], new: NewFlight) -> list[Any]:
-    with Console(settings(tmp_path, workers=1, maps=(maps,))) as console:
+@dataclass(frozen=True)
+class Undisturbed:
+    """A flight over GROUND from its images to its completion, which no one disturbs."""
+
+    new: NewFlight
+    images: list[tuple[str, Path]]
+    expected: list[Any]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    lat, lon = lat_lon(place_of(FRAMES[0]))
+    new = NewFlight.model_validate({**NEW, "start": {"lat": lat, "lon": lon}})
+    images = write_images(folder, FRAMES, GROUND)
+    with Console(settings(folder, workers=1, maps=(maps,))) as console:
         client = ConsoleClient(console.url)
         flight_id = client.create(new).flight_id
         list(client.upload(flight_id, images))
         client.complete(flight_id)
-        return stored(client, flight_id)
+        expected = stored(client, flight_id)
+    assert len(expected[0][0]) == len(FRAMES)
+    return Undisturbed(new, images, expected)
 
 
-def killed_at(data: Path, maps: Path, images: list[tuple[str, Path]], new: NewFlight) -> Iterator[Any]:
+def killed_at(data: Path, maps: Path, flight: Undisturbed) -> Iterator[Any]:
     """Kills the service after some events, and ends the next one in order."""
     served = Served(data, maps=(maps,))
-    flight_id = served.client.create(new).flight_id
-    list(served.client.upload(flight_id, images))
+    flight_id = served.client.create(flight.new).flight_id
+    list(served.client.upload(flight_id, flight.images))
     served.client.complete(flight_id)
     for event in served.client.events(flight_id):
         if event.event_id >= KILLED_AT:
@@ -114,14 +134,46 @@ def killed_at(data: Path, maps: Path, images: list[tuple[str, Path]], new: NewFl
     yield served.process.wait(timeout=60)
 
 
-def test_a_service_that_is_killed_goes_on_to_the_same_results_and_events(tmp_path: Path, maps: Path) -> None:
-    lat, lon = lat_lon(place_of(10))
-    new = NewFlight.model_validate({**NEW, "start": {"lat": lat, "lon": lon}})
-    images = write_images(tmp_path, range(10, 20), GROUND)
-    expected = undisturbed(tmp_path / "calm", maps, images, new)
-    after_kills, exit_code = killed_at(tmp_path / "killed", maps, images, new)
-    assert after_kills == expected
+def test_a_service_that_is_killed_goes_on_to_the_same_results_and_events(
+    tmp_path: Path, maps: Path, undisturbed: Undisturbed
+) -> None:
+    after_kills, exit_code = killed_at(tmp_path, maps, undisturbed)
+    assert after_kills == undisturbed.expected
     assert exit_code == 0
+
+
+def computing(cluster: LocalCluster) -> list[int]:
+    """Indices of the workers that have a child process."""
+    parents = {int(path.read_text().rpartition(")")[2].split()[1]) for path in Path("/proc").glob("[0-9]*/stat")}
+    return [i for i, worker in enumerate(cluster.workers) if worker.pid in parents]
+
+
+def flown_by(cluster: LocalCluster, data: Path, maps: Path, flight: Undisturbed) -> list[Any]:
+    """Of the cluster, the first worker that has the flight is killed."""
+    with Console(settings(data, workers=1, maps=(maps,), scheduler=cluster.address)) as console:
+        client = ConsoleClient(console.url)
+        flight_id = client.create(flight.new).flight_id
+        list(client.upload(flight_id, flight.images))
+        client.complete(flight_id)
+        for event in client.events(flight_id):
+            if event.event_id == KILLED_AT:
+                (busy,) = computing(cluster)
+                cluster.workers[busy].kill()
+                cluster.workers[busy].wait()
+        assert [worker.poll() for worker in cluster.workers].count(None) == 1
+        return stored(client, flight_id)
+
+
+def test_a_cluster_whose_worker_is_killed_gives_the_results_and_events_of_this_computer(
+    tmp_path: Path, maps: Path, undisturbed: Undisturbed
+) -> None:
+    (tmp_path / "cluster").mkdir()
+    with local_cluster(tmp_path / "cluster", workers=2) as cluster:
+        assert flown_by(cluster, tmp_path / "there", maps, undisturbed) == undisturbed.expected
+        until = time.monotonic() + WAIT_S
+        while computing(cluster):
+            assert time.monotonic() < until, "the program ends with its flight"
+            time.sleep(0.05)
 
 
 def test_the_map_of_a_route_is_made_from_the_sources_and_a_route_beyond_them_blocks_the_flight(
