@@ -231,12 +231,12 @@ def _simulated(out: Path, name: str) -> Path:
 
 def tables(result: dict[str, Any]) -> list[Table]:
     """Figures and distances as tables, in metres but for focal length and points."""
-    errors = _table("Error, median / 95 % [m]", "row", *OUTPUTS, "focal length after, px", "map points, px")
+    errors = _table("Error, median / 95 %, m", "row", *OUTPUTS, "focal length after, px", "map points, px")
     for flight, rows in result["figures"].items():
         for name, found in rows.items():
             cells = [f"{found[output]['median_m']:.1f} / {found[output]['p95_m']:.1f}" for output in OUTPUTS]
             errors.add_row(flight, name, *cells, _focal(found["focal_px"]), _points(found["map_points_px"]))
-    apart = _table("Distance between two answers, median / 95 % / largest [m]", "rows", *OUTPUTS)
+    apart = _table("Distance between two answers, median / 95 % / largest, m", "rows", *OUTPUTS)
     for flight, pairs in result["distances"].items():
         for name, found in pairs.items():
             apart.add_row(flight, name, *(_spread(found[output]) for output in OUTPUTS))
