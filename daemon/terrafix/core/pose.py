@@ -9,7 +9,7 @@ import numpy as np
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)  # of a tangent vector [spec: Pose3 tangent order]
 HUBER_K = 1.345  # threshold in sigmas: 95 % efficiency on Gaussian noise (Huber 1981)
-MAX_ITERATIONS = 15
+MAX_ITERATIONS, MAX_CUT_ITERATIONS = 15, 40  # the second with a cutoff, whose weights change with the pose
 MAX_CONDITION = 1e9  # condition number of the scaled normal equations; a well-conditioned geometry has less than ten
 STEP_TOLERANCE = 1e-5  # last step [rad, and metres relative to depth]: a hundredth of a pixel, below the noise
 
@@ -78,6 +78,7 @@ def fit_pose(
     independent_share: float = 1.0,
     tilt_sigma_rad: float | None = None,
     tolerance: float = STEP_TOLERANCE,
+    cutoff: float | None = None,
 ) -> PoseFit | None:
     """Robust least squares on the reprojection error of points (N, 3) observed at normalised ``xy`` (N, 2).
 
@@ -85,22 +86,29 @@ def fit_pose(
     ``weights`` (N,): extra weight of each match. ``independent_share``: share of the matches that counts as independent
     (neighbouring patches share pixels; relief displaces whole blocks of patches). ``tilt_sigma_rad``: 1-sigma of a
     prior on the tilt of the given ``r_w_c``, needed because matches in a narrow band cannot separate tilt from
-    translation; None: no prior. ``tolerance``: size of the last step, rad and metres relative to depth. Returns
-    ``None`` when the geometry does not determine a pose."""
+    translation; None: no prior. ``tolerance``: size of the last step, rad and metres relative to depth. ``cutoff``:
+    reprojection error, normalised, from which a match counts nothing; its weight falls to zero there without a step
+    (Beaton and Tukey 1974), so which matches count does not depend on where the iteration began. Returns ``None`` when
+    the geometry does not determine a pose."""
     sigma = sigma_floor
     r, p = r_w_c, p_c_in_w_m
     hessian = np.eye(6)
     norm = np.zeros(len(xy))
     scale = np.ones(6)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(MAX_ITERATIONS if cutoff is None else MAX_CUT_ITERATIONS):
         predicted, jacobian, depth = project_with_jacobian(r, p, points_w_m)
         if depth.min() <= 0:
             return None
         error = xy - predicted
         norm = np.sqrt(np.einsum("ni,ni->n", error, error))
-        sigma = max(sigma_floor, _median(norm) / 1.177)  # the median of a Rayleigh distribution is 1.177 sigma
+        agrees = None if cutoff is None else biweight(norm, cutoff)
+        if agrees is not None and weights is not None:
+            agrees *= weights
+        sigma = max(sigma_floor, _spread(norm, agrees))
         w = np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
-        if weights is not None:
+        if agrees is not None:
+            w *= agrees
+        elif weights is not None:
             w *= weights
         flat = jacobian.reshape(-1, 6)
         weighted = flat.T * np.repeat(w, 2)
@@ -122,6 +130,19 @@ def fit_pose(
             break
     cov = sigma**2 / max(independent_share, 1e-6) * np.linalg.inv(hessian)
     return PoseFit(r, p, (cov + cov.T) / 2, norm, sigma)
+
+
+def biweight(norm: np.ndarray, cutoff: float) -> np.ndarray:
+    """Weights (N,) of residual norms (N,): 1 at zero, 0 from ``cutoff`` on (Beaton and Tukey 1974)."""
+    return np.asarray(np.square(np.maximum(1.0 - np.square(norm / cutoff), 0.0)))
+
+
+def _spread(norm: np.ndarray, weights: np.ndarray | None) -> float:
+    """1-sigma of one coordinate from residual norms (N,): by their median, or, where matches count by ``weights``, by
+    their mean square, which has no step where a match begins to count."""
+    if weights is None:
+        return _median(norm) / 1.177  # the median of a Rayleigh distribution is 1.177 sigma
+    return math.sqrt(0.5 * float(weights @ np.square(norm)) / max(float(weights.sum()), 1e-12))
 
 
 def _median(values: np.ndarray) -> float:

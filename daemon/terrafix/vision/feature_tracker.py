@@ -33,8 +33,11 @@ KLT_LEVELS = 4
 FORWARD_BACKWARD_PX = 1.0  # forward-backward check: larger return error rejects a track (Kalal 2010)
 MIN_INLIERS = 20
 MIN_INLIER_RATIO = 0.35
-KEYFRAME_SHIFT = 0.22  # median shift for a new keyframe, fraction of the image width: three quarters still overlap
-KEYFRAME_TRACKED = 0.45  # minimum fraction of the keyframe's corners that are still tracked
+# Median shift for a new keyframe, fraction of the image width: nine tenths still overlap. It moves smoothly and far
+# from frame to frame, where the number of corners that are still tracked falls by a few: as the first to be reached, it
+# chooses the same frame whichever of these are lost.
+KEYFRAME_SHIFT = 0.12
+KEYFRAME_TRACKED = 0.3  # minimum fraction of the keyframe's corners that are still tracked
 MAX_FAILURES = 5  # consecutive registration failures before a new fragment starts (PB-5)
 MAX_PAIRS = 48
 SIGMA_PX = 0.75  # 1-sigma of a matched coordinate; tracks drift with rotation and exposure steps (measured 0.4 to 0.9)
@@ -244,7 +247,7 @@ class FrameTracker:
         if three.sum() < MIN_TRIPLES:
             return _NO_TRIPLES
         positions, index = positions[three], index[three]
-        pick = select_spread(keyframe.corners[index], MAX_TRIPLES)
+        pick = select_spread(keyframe.corners[index], MAX_TRIPLES, self._size_px)
         views = keyframe.previous_corners[index[pick]], keyframe.corners[index[pick]], positions[pick]
         return np.hstack([self._camera.normalise(px) for px in views])
 
@@ -280,7 +283,7 @@ class FrameTracker:
 
     def _published(self, a: np.ndarray, b: np.ndarray, inliers: int, tracked: int) -> tuple[np.ndarray, float]:
         """-> at most MAX_PAIRS of the matches (N, 2), (N, 2) px, normalised (M, 4), and the 1-sigma of a coordinate."""
-        pick = select_spread(a, MAX_PAIRS)
+        pick = select_spread(a, MAX_PAIRS, self._size_px)
         two_view = np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])])
         # A consensus with a low inlier ratio may be a roof instead of the ground: its sigma is larger.
         return two_view, SIGMA_PX / self._camera.fx / float(np.sqrt(inliers / tracked))

@@ -3,6 +3,8 @@
 import cv2
 import numpy as np
 
+from terrafix.vision.two_view import fit_homography
+
 WINDOW_PX = 21
 FORWARD_BACKWARD_PX = 0.5  # forward-backward check (Kalal 2010)
 PYRAMID_LEVELS = 1  # pyramid levels; patches are first warped by a homography and then match within a pixel or two
@@ -16,7 +18,7 @@ def align_patches(
 
     Tracks drift by 0.3 px in five frames and by 0.9 px in sixteen; the error after alignment is 0.15 px
     (docs/monte-carlo.md)."""
-    h, _ = cv2.findHomography(corners, tracked, cv2.RANSAC, max_shift_px, maxIters=1500, confidence=0.999)
+    h = fit_homography(corners, tracked, max_shift_px)
     if h is None:
         return np.zeros((0, 2), np.float32), np.zeros(0, int)
     warped = cv2.warpPerspective(from_gray, h, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)

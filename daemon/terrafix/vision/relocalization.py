@@ -9,7 +9,7 @@ import numpy as np
 from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.messages import Frame, Relocalization
 from terrafix.vision.covisibility import COARSE_FEATURES, COARSE_WIDTH_PX
-from terrafix.vision.feature_tracker import KEYFRAME_SHIFT, MAX_PAIRS, SIGMA_PX, Motion
+from terrafix.vision.feature_tracker import MAX_PAIRS, SIGMA_PX, Motion
 from terrafix.vision.features import Features, SiftMatcher
 from terrafix.vision.keyframe_database import KeyframeDatabase, StoredKeyframe
 from terrafix.vision.two_view import TwoView, TwoViewGeometry, select_spread
@@ -19,6 +19,7 @@ INTERVAL_NS = 1_000_000_000  # between two searches: 50 ms of one core, 5 % of i
 # Image widths of way, from which a keyframe of the same fragment is another visit to its ground. Shorter loops would be
 # a second odometry whose scale errors, which are those of the first, the estimator would take for independent.
 APART = 1.5
+SAME_VIEW_SHIFT = 0.22  # fraction of the image width: two views closer than that share three quarters of their ground
 OLDEST_SHARE = 0.5  # of the inliers of the best candidate: an older one with so many has drifted less
 
 
@@ -123,10 +124,10 @@ class RelocalizationSearch:
             return False
         centre = np.array([[[self._camera.width / 2, self._camera.height / 2]]])
         moved = np.linalg.norm(cv2.perspectiveTransform(centre, h) - centre)
-        return float(moved) < KEYFRAME_SHIFT * self._camera.width
+        return float(moved) < SAME_VIEW_SHIFT * self._camera.width
 
     def _message(self, frame: Frame, view: _View, keyframe: StoredKeyframe, two_view: TwoView) -> Relocalization:
-        pick = select_spread(two_view.a_px, MAX_PAIRS)
+        pick = select_spread(two_view.a_px, MAX_PAIRS, (self._camera.width, self._camera.height))
         pairs = np.hstack([self._camera.normalise(px[pick]) for px in (two_view.a_px, two_view.b_px)])
         return Relocalization(
             t_ns=frame.t_ns,

@@ -15,6 +15,12 @@ from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.vision.features import Matches
 
 RANSAC_PX = 2.5  # 0.4 m from 100 m; excludes points above the ground
+# Of that threshold, where a match counts nothing, and before that in the first steps: over relief there are several
+# homographies near by that a third of the matches leaves for the last bit, and from afar one is the best
+CUTOFF, WIDER = 1.25, (5.0, 5.0, 4.0, 3.2, 2.5, 2.0, 1.6)
+# Matches of a homography, at least; steps of its reweighted least squares with CUTOFF, at most, and the last one [px];
+# by how much the diagonal of their normal equations is larger, so that points on a line have a solution
+MIN_HOMOGRAPHY, MAX_STEPS, STEP_PX, RIDGE = 8, 20, 1e-4, 1e-9
 MIN_SPREAD = 0.12  # inliers must span this fraction of image width and height, else the pose is not determined
 MIN_INLIERS = 15  # by chance, 4 to 9 of 100 wrong matches agree
 MIN_INLIER_RATIO = 0.15
@@ -107,19 +113,75 @@ def covers_image(points: np.ndarray, size_px: tuple[int, int]) -> bool:
 
 
 def homography_inliers(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) bool: matches (N, 2), (N, 2) px that agree with one RANSAC homography."""
-    if len(a) < 8:
-        return np.zeros(len(a), bool)
-    _, mask = cv2.findHomography(a, b, cv2.RANSAC, RANSAC_PX, maxIters=1500, confidence=0.999)
-    return np.zeros(len(a), bool) if mask is None else mask.ravel().astype(bool)
+    """(N,) bool: matches (N, 2), (N, 2) px that agree with the homography of most of them."""
+    matrix = fit_homography(a, b, RANSAC_PX)
+    return np.zeros(len(a), bool) if matrix is None else _transfer_px(matrix, a, b) < RANSAC_PX
 
 
-def select_spread(points: np.ndarray, limit: int) -> np.ndarray:
-    """Indices of at most ``limit`` points, round-robin over an 8 x 6 grid, for an even distribution over the image."""
+def fit_homography(a: np.ndarray, b: np.ndarray, threshold_px: float) -> np.ndarray | None:
+    """Homography (3, 3) of most of the matches (N, 2), (N, 2) px; None: they are too few. RANSAC finds it, and
+    reweighted least squares over all matches make of whichever sample it drew the same one: a weight that falls to zero
+    with the distance leaves no match that hangs on the last bit (Beaton and Tukey 1974)."""
+    if len(a) < MIN_HOMOGRAPHY:
+        return None
+    matrix, _ = cv2.findHomography(a, b, cv2.RANSAC, threshold_px, maxIters=1500, confidence=0.999)
+    if matrix is None:
+        return None
+    centre, scale = a.mean(axis=0), max(float(a.std()), 1e-6)
+    local = np.array([[scale, 0.0, centre[0]], [0.0, scale, centre[1]], [0.0, 0.0, 1.0]])
+    matrix, points = matrix @ local, np.column_stack([(a - centre) / scale, np.ones(len(a))])
+    matrix = matrix / matrix[2, 2]
+    for share in (*WIDER, *[CUTOFF] * MAX_STEPS):
+        step = _homography_step(matrix, points, b, share * threshold_px)
+        if not np.isfinite(step).all():
+            break
+        matrix = matrix + step
+        if share == CUTOFF and float(np.abs(step).max()) < STEP_PX:
+            break
+    return np.asarray(matrix @ np.linalg.inv(local))
+
+
+def _homography_step(matrix: np.ndarray, points: np.ndarray, b: np.ndarray, cutoff_px: float) -> np.ndarray:
+    """(3, 3) Gauss-Newton step of a homography with 1 as its last entry, from ``points`` (N, 3), homogeneous, to ``b``
+    (N, 2) px."""
+    mapped = points @ matrix.T
+    to = mapped[:, :2] / mapped[:, 2:]
+    off = b - to
+    weight = np.square(np.maximum(1.0 - np.einsum("ni,ni->n", off, off) / cutoff_px**2, 0.0)) / np.square(mapped[:, 2])
+    # By the rows of the matrix: the point for u or v, and less u or v times the point for the last one.
+    weighted = points * weight[:, None]
+    normal = np.zeros((8, 8))
+    normal[:3, :3] = normal[3:6, 3:6] = weighted.T @ points
+    for k in (0, 1):
+        rows = slice(3 * k, 3 * k + 3)
+        normal[rows, 6:] = -weighted.T @ (points[:, :2] * to[:, k : k + 1])
+        normal[6:, rows] = normal[rows, 6:].T
+    square = np.einsum("ni,ni->n", to, to)
+    normal[6:, 6:] = (weighted[:, :2] * square[:, None]).T @ points[:, :2]
+    normal[range(8), range(8)] *= 1.0 + RIDGE
+    weighted = weighted * mapped[:, 2:]
+    along = np.einsum("ni,ni->n", to, off)
+    right = np.concatenate([*(weighted.T @ off).T, -(weighted[:, :2].T @ along)])
+    if not (np.isfinite(normal).all() and normal.diagonal().min() > 0.0):
+        return np.full((3, 3), np.nan)
+    return np.append(np.linalg.solve(normal, right), 0.0).reshape(3, 3)
+
+
+def _transfer_px(matrix: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N,) distance of the points ``b`` from those to which ``matrix`` (3, 3) takes ``a``; infinite beyond its
+    horizon."""
+    mapped = np.column_stack([a, np.ones(len(a))]) @ matrix.T
+    ahead = mapped[:, 2] * matrix[2, 2] > 0.0
+    off = np.linalg.norm(mapped[:, :2] / np.where(ahead, mapped[:, 2], 1.0)[:, None] - b, axis=1)
+    return np.where(ahead, off, np.inf)
+
+
+def select_spread(points: np.ndarray, limit: int, size_px: tuple[int, int]) -> np.ndarray:
+    """Indices of at most ``limit`` points, round-robin over an 8 x 6 grid of the image, for an even distribution. A
+    grid of the points themselves would move with any one at their border, and select others everywhere."""
     if len(points) <= limit:
         return np.arange(len(points))
-    low, span = points.min(0), np.maximum(np.ptp(points, axis=0), 1.0)
-    cell = np.minimum((points - low) / span * (8, 6), (7, 5)).astype(int)
+    cell = np.clip(points / size_px * (8, 6), 0, (7, 5)).astype(int)
     key = cell[:, 1] * 8 + cell[:, 0]
     order = np.argsort(key, kind="stable")
     first = np.r_[True, np.diff(key[order]) > 0]

@@ -191,6 +191,31 @@ def test_the_pose_is_deterministic() -> None:
     assert np.array_equal(once.inliers, again.inliers)
 
 
+def test_the_pose_does_not_depend_on_which_sample_ransac_draws() -> None:
+    """Another order of the matches is another sample. On the inliers of the first result alone it moved by 0.8 m."""
+    rng = np.random.default_rng(5)
+    points, xy = scene(rng, 40, 0.0)
+    xy += rng.normal(0.0, 0.008, xy.shape)  # as patches of a map that is years old
+    points[:15, :2] += rng.uniform(-6.0, 6.0, (15, 2))
+    found = []
+    for seed in range(6):
+        order = np.random.default_rng(seed).permutation(40)
+        fit = solve_equal_weights(points[order], xy[order]).fit
+        assert fit is not None
+        found.append(fit.p_c_in_w_m)
+    assert np.ptp(found, axis=0).max() < 0.02
+
+
+def test_a_match_whose_weight_vanishes_changes_nothing() -> None:
+    points, xy = scene(np.random.default_rng(5), 30, 0.0)
+    with_it, without = (
+        solve(points[:n], xy[:n], np.r_[np.ones(29), np.full(n - 29, 1e-9)], GIVEN).fit for n in (30, 29)
+    )
+    assert with_it is not None and without is not None
+    assert with_it.p_c_in_w_m == pytest.approx(without.p_c_in_w_m, abs=1e-3)
+    assert with_it.cov == pytest.approx(without.cov, rel=0.01, abs=1e-7)
+
+
 def mean_nees(wrong: int) -> float:
     """Mean NEES of poses from 48 patches with an error of 0.8 % of the height, of which ``wrong`` are at random
     places."""

@@ -6,7 +6,6 @@ the tracks scatter about their homography as those of the real flights do (docs/
 
 from dataclasses import dataclass
 
-import cv2
 import msgspec
 import numpy as np
 
@@ -14,7 +13,7 @@ from terrafix.core.limits import MAX_KEYFRAME_AGE
 from terrafix.messages import Odometry, Verdict
 from terrafix.vision import feature_tracker as real
 from terrafix.vision import repeated_picture
-from terrafix.vision.two_view import RANSAC_PX
+from terrafix.vision.two_view import RANSAC_PX, homography_inliers
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.lens import Lens
@@ -154,8 +153,7 @@ class SimulatedOdometry:
         a, b = keyframe.px[keyframe.tracked], (px + keyframe.off_px + keyframe.slip_px + noise)[keyframe.tracked]
         if len(a) < real.MIN_INLIERS:
             return None
-        _, mask = cv2.findHomography(a, b, cv2.RANSAC, RANSAC_PX, maxIters=1500, confidence=0.999)
-        inlier = np.zeros(len(a), bool) if mask is None else mask.ravel().astype(bool)
+        inlier = homography_inliers(a, b)
         if inlier.sum() < real.MIN_INLIERS or inlier.mean() < real.MIN_INLIER_RATIO:
             return None
         keyframe.tracked[np.flatnonzero(keyframe.tracked)[~inlier]] = False  # outliers are dropped for good

@@ -13,13 +13,22 @@ import numpy as np
 from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
-from terrafix.anchor.matching.orthorectify import Rectified, rectify
+from terrafix.anchor.matching.orthorectify import Rectified, patch_centres, rectify
 from terrafix.anchor.matching.patch_matcher import match_patches
 from terrafix.anchor.matching.point_mass_filter import LLR_SLOPE, LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, PnpResult, solve
+from terrafix.core.pnp import (
+    CUTOFF,
+    INDEPENDENT_SHARE,
+    INLIER_THRESHOLD,
+    MIN_INLIERS,
+    SEARCH_RADIUS,
+    PnpResult,
+    solve,
+)
+from terrafix.core.pose import biweight, fit_pose
 from terrafix.map.package import LocalMap
 from terrafix.messages import PnpInput, Verdict
 from terrafix_engines.correlation import GraphCorrelator
@@ -39,6 +48,7 @@ MAX_WINDOW_CELLS = 640
 MAX_FINE_HYPOTHESES = 9
 # side of a patch as a share of the height: 25 m at 100 m, one house and its surroundings [measured: docs/search.md]
 PATCH_PER_AGL = 0.25
+PATCH_STEP = PATCH_PER_AGL / 2  # between patches, normalised [spec: they overlap by half]
 MIN_PATCH_CELLS = 8  # smallest side of a patch, cells [tuned]
 # Fewest inliers of a pose on learned descriptors. A cell of a learned model has a receptive field of a hundred pixels,
 # so that errors of neighbours are correlated. With 14 inliers required, 5 of 560 frames from other places had a pose;
@@ -278,7 +288,7 @@ class FrameMatcher:
             first = self._patch_fix(describer, image, view, FIRST_SEARCH_RADIUS, FIRST_THRESHOLD)
             if first is None or first.pnp.fit is None:
                 return first
-            view = view_of_fix(view, first)
+            view = levelled_view(view, first)
         return self._patch_fix(describer, image, view, SEARCH_RADIUS, INLIER_THRESHOLD)
 
     def refine_fix(self, image: Image, view: View, fix: Fix) -> Fix:
@@ -306,8 +316,9 @@ class FrameMatcher:
         width, height = mask.shape[1] + 2 * radius + 4, mask.shape[0] + 2 * radius + 4
         features = self.gradient_features if describer is self.gradients else self._features
         window, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
+        centres = patch_centres(self.camera, view.r_w_c, view.agl_m, frame, cell, PATCH_STEP)
         found = match_patches(
-            template, frame, mask, cell, window, valid, (e_min, n_max), (view.e_m, view.n_m), patch, radius
+            template, frame, mask, cell, window, valid, (e_min, n_max), (view.e_m, view.n_m), patch, radius, centres
         )
         rays = np.column_stack([found.frame_m, np.full(len(found.frame_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
@@ -357,6 +368,25 @@ def view_of_fix(view: View, fix: Fix) -> View:
     p = fix.pnp.fit.p_c_in_w_m
     agl_m = float(p[2]) - float(fix.points_w_m[:, 2].mean())
     return replace(view, e_m=float(p[0]), n_m=float(p[1]), r_w_c=fix.pnp.fit.r_w_c, agl_m=agl_m)
+
+
+def levelled_view(view: View, fix: Fix) -> View:
+    """``view_of_fix``, with the tilt that was predicted as a prior. A dozen patches leave the tilt to some degrees, and
+    the position to as much of the height: a frame rectified by them alone would be another one for each patch more."""
+    assert fix.pnp.fit is not None and fix.given is not None
+    agrees = fix.weights * biweight(fix.pnp.fit.residuals, CUTOFF * fix.given.threshold)
+    r_w_c, p_m = view.r_w_c, fix.pnp.fit.p_c_in_w_m
+    fit = fit_pose(
+        fix.points_w_m,
+        fix.xy,
+        r_w_c,
+        p_m,
+        fix.given.sigma_floor,
+        agrees,
+        INDEPENDENT_SHARE,
+        tilt_sigma_rad=view.tilt_sigma_rad,
+    )
+    return view_of_fix(view, fix if fit is None else replace(fix, pnp=replace(fix.pnp, fit=fit)))
 
 
 def without_colour(image: Image, describer: Describer) -> Image:

@@ -87,6 +87,22 @@ def rectify(
     return Rectified(flat, mask, e_min, n_max, gsd_m)
 
 
+def patch_centres(
+    camera: CameraCalibration, r_w_c: np.ndarray, agl_m: float, frame: Rectified, cell_m: float, step: float
+) -> np.ndarray:
+    """(N, 2) row and column, in cells of ``cell_m``, of the points of a fixed grid of the image in its rectified
+    ``frame``; ``step``: between two of them, normalised. Points of the image, because a grid of the frame begins at its
+    border, which moves with height and attitude: other patches would be matched for a tenth of a degree."""
+    w, h = camera.width - 1.0, camera.height - 1.0
+    corners = camera.normalise(np.array([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)]))
+    (left, top), (right, bottom) = np.ceil(corners.min(axis=0) / step), np.floor(corners.max(axis=0) / step) + 1.0
+    y, x = (axis.ravel() * step for axis in np.mgrid[top:bottom, left:right])
+    rays = np.column_stack([x, y, np.ones(len(x))]) @ r_w_c.T
+    rays = rays[rays[:, 2] < -MIN_DOWN]
+    ground_m = rays[:, :2] / -rays[:, 2:] * agl_m
+    return np.column_stack([frame.n_max_m - ground_m[:, 1], ground_m[:, 0] - frame.e_min_m]) / cell_m
+
+
 def _lens_map(camera: CameraCalibration, to_camera: np.ndarray, width: int, height: int) -> np.ndarray:
     """(height, width, 2) float32: pixel of the frame at each rectified pixel, far outside of it for ground behind the
     camera. ``to_camera`` (3, 3): rectified pixel (x, y, 1) -> ray in the camera."""

@@ -23,6 +23,8 @@ SCALE_RANGE, SCALE_STEPS = 0.08, 7  # half range of the scale grid, relative, an
 # 1-sigma of the yaw and scale error that a hypothesis of the search leaves [tuned]
 YAW_SIGMA_RAD, SCALE_SIGMA = np.radians(5.0), 0.05
 PATCH_SPREAD = 0.02  # share of the height, 1-sigma of a patch's displacement by relief and leaning buildings [tuned]
+# log weight of a cell by its standardised correlation [spec: a tenth of a sigma below the peak counts half]
+PEAK_SHARPNESS = 6.0
 # shares of the height: search radius of the patches in successive Gauss-Newton iterations [tuned]
 SEARCH_RADII = (0.05, 0.04, 0.03, 0.03)
 
@@ -31,12 +33,17 @@ SEARCH_RADII = (0.05, 0.04, 0.03, 0.03)
 class PatchConsensus:
     """``llr``: evidence in nats before the null model is subtracted. ``motion`` (6,): east, north, yaw, scale, tilt
     about north and east; small angles, lengths in heights. ``offsets`` (N, 2): displacement of each patch from its
-    expected place, east and north in heights; ``inliers`` (N,) bool."""
+    expected place, east and north in heights; ``values`` (N,): its evidence in nats."""
 
     llr: float
     motion: np.ndarray
     offsets: np.ndarray
-    inliers: np.ndarray
+    values: np.ndarray
+
+    @property
+    def inliers(self) -> np.ndarray:
+        """(N,) bool: patches with evidence for the place."""
+        return np.asarray(self.values > 0.0)
 
 
 def estimate_consensus(surfaces: np.ndarray, ground: np.ndarray, cell: float, tilt_sigma_rad: float) -> PatchConsensus:
@@ -56,7 +63,7 @@ def estimate_consensus(surfaces: np.ndarray, ground: np.ndarray, cell: float, ti
         motion = np.linalg.solve(hessian, np.einsum("nki,nk->i", weighted, offsets))
     offsets, value = _best_offsets(z, llr, jacobian @ motion, cell, PATCH_SPREAD)
     prior = 0.5 * float(((motion / sigma) ** 2).sum())
-    return PatchConsensus(INDEPENDENT_SHARE * float(value.sum()) - prior, motion, offsets, value > 0.0)
+    return PatchConsensus(INDEPENDENT_SHARE * float(value.sum()) - prior, motion, offsets, value)
 
 
 def _log_likelihood_ratio(z: np.ndarray) -> np.ndarray:
@@ -107,18 +114,28 @@ def _grid_search(llr: np.ndarray, jacobian: np.ndarray, cell: float) -> np.ndarr
 def _best_offsets(
     z: np.ndarray, llr: np.ndarray, expected: np.ndarray, cell: float, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Best place of each patch within ``radius`` of its ``expected`` offset (N, 2), as an offset, and its evidence
-    (N,); 0 outside of the surface. The maximum is taken over ``z``: around a clear peak several cells reach the bound
-    of ``llr``, and the first of them would bias the result to the north-west."""
+    """Place of each patch within ``radius`` of its ``expected`` offset (N, 2), as an offset, and its best evidence
+    (N,); 0 outside of the surface. The place is the mean of the cells, weighted by ``z``, and by less towards the
+    border of the search: of two cells that are almost equally high neither wins by its last bit. By ``z``, because
+    around a clear peak several cells reach the bound of ``llr``."""
     side = llr.shape[1]
     k = max(round(radius / cell), 1)
+    reach2 = (max(radius / cell, 1.0) + 1.0) ** 2  # a cell beyond, where the weight is zero
+    rows, columns = side // 2 - expected[:, 1] / cell, side // 2 + expected[:, 0] / cell
     offsets, value = expected.copy(), np.zeros(len(llr))
-    for i, (surface, (e, n)) in enumerate(zip(z, expected, strict=True)):
-        r, c = round(side // 2 - n / cell), round(side // 2 + e / cell)
-        if 0 <= r < side and 0 <= c < side:
-            top, left = max(r - k, 0), max(c - k, 0)
-            near = surface[top : r + k + 1, left : c + k + 1]
-            dr, dc = np.unravel_index(int(np.argmax(near)), near.shape)
-            value[i] = llr[i, top + int(dr), left + int(dc)]
-            offsets[i] = (left + int(dc) - side // 2) * cell, (side // 2 - top - int(dr)) * cell
+    for i, (surface, row, column) in enumerate(zip(z, rows.tolist(), columns.tolist(), strict=True)):
+        r, c = round(row), round(column)
+        if not (0 <= r < side and 0 <= c < side):
+            continue
+        top, left = max(r - k, 0), max(c - k, 0)
+        near = surface[top : r + k + 1, left : c + k + 1]
+        best = int(np.argmax(near))
+        value[i] = llr[i, top : r + k + 1, left : c + k + 1].ravel()[best]
+        dr = np.arange(top, top + near.shape[0]) - row
+        dc = np.arange(left, left + near.shape[1]) - column
+        weight = np.exp(PEAK_SHARPNESS * (near - near.ravel()[best]))
+        weight *= np.maximum(1.0 - (dr[:, None] ** 2 + dc**2) / reach2, 0.0)
+        total = float(weight.sum())
+        offsets[i, 0] += float(weight.sum(axis=0) @ dc) / total * cell
+        offsets[i, 1] -= float(weight.sum(axis=1) @ dr) / total * cell
     return offsets, value

@@ -8,15 +8,16 @@ import numpy as np
 from terrafix.anchor.matching.frame_matcher import (
     FIX_GSD_PER_AGL,
     PATCH_PER_AGL,
+    PATCH_STEP,
     Fix,
     FrameMatcher,
     View,
     view_of_fix,
     without_colour,
 )
-from terrafix.anchor.matching.orthorectify import rectify
+from terrafix.anchor.matching.orthorectify import patch_centres, rectify
 from terrafix.anchor.matching.patch_matcher import correlate_patches
-from terrafix.anchor.verification.patch_consensus import PatchConsensus, estimate_consensus
+from terrafix.anchor.verification.patch_consensus import MAX_LLR, PatchConsensus, estimate_consensus
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 from terrafix.core.pnp import MIN_INLIERS, SEARCH_RADIUS, PnpResult
@@ -79,7 +80,10 @@ class PlaceVerifier:
         row0 = round((n_max_m - (view.n_m + frame.n_max_m)) / cell_m)
         column0 = round((view.e_m + frame.e_min_m - e_min_m) / cell_m)
         template = self._matcher.gradients.describe(frame.image)
-        corners, surfaces = correlate_patches(template, frame.mask, window, valid, patch, radius, row0, column0)
+        centres = patch_centres(camera, view.r_w_c, view.agl_m, frame, cell_m, PATCH_STEP)
+        corners, _, surfaces = correlate_patches(
+            template, frame.mask, window, valid, patch, radius, row0, column0, centres
+        )
         if len(corners) < MIN_INLIERS:
             return None
         centres = np.array(corners) + 0.5 * patch
@@ -124,7 +128,8 @@ class PlaceVerifier:
         xy = rays[:, :2] / rays[:, 2:]
         up = self._map.elevation(map_m[:, 0], map_m[:, 1])
         up = np.full(len(xy), view.ground_m) if up is None else np.where(np.isfinite(up), up, view.ground_m)
-        points, weights = np.column_stack([map_m, up]), np.ones(len(xy))
+        # By its evidence, so that none comes or goes by a step.
+        points, weights = np.column_stack([map_m, up]), np.clip(found.values / MAX_LLR, 0.0, 1.0)
         start = np.array([view.e_m, view.n_m, view.ground_m + view.agl_m])
         fit = None
         if found.inliers.sum() >= MIN_INLIERS:
@@ -134,6 +139,7 @@ class PlaceVerifier:
                 view.r_w_c,
                 start,
                 PATCH_SIGMA if tilt_sigma_rad is None else SIGMA_FLOOR,
+                weights[found.inliers],
                 independent_share=0.25,
                 tilt_sigma_rad=tilt_sigma_rad,
             )

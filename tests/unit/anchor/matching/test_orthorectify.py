@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from terrafix.anchor.matching.orthorectify import footprint, rectify
+from terrafix.anchor.matching.orthorectify import footprint, patch_centres, rectify
 from terrafix.core.camera import CameraCalibration
 from textured_ground import LENS, PINHOLE, FlatMap, rotation, texture, view
 
@@ -116,3 +116,21 @@ def test_ground_behind_the_camera_is_not_inside_of_the_frame() -> None:
     depth = (np.column_stack([ground, np.full(w * h, -90.0)]) @ tilted)[:, 2].reshape(h, w)
     assert (depth <= 0).any() and not flat.mask[depth <= 0].any()
     assert flat.mask.any()
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, LENS])
+def test_patches_are_at_the_same_points_of_the_image_whatever_the_pose(camera: CameraCalibration) -> None:
+    """Those of a grid that begins at the border of the rectified frame moved with height and attitude."""
+    grey = np.zeros((camera.height, camera.width), np.uint8)
+    seen = []
+    for attitude, agl_m in (((20.0, 0.0, 0.0), 90.0), ((21.0, 1.0, -2.0), 97.0)):
+        r = rotation(*attitude)
+        frame = rectify(grey, camera, r, agl_m, GSD_M)
+        assert frame is not None
+        cells = patch_centres(camera, r, agl_m, frame, GSD_M, 0.125)
+        ground_m = np.array([frame.e_min_m, frame.n_max_m]) + cells[:, ::-1] * (GSD_M, -GSD_M)
+        rays = np.column_stack([ground_m, np.full(len(cells), -agl_m)]) @ r
+        seen.append(rays[:, :2] / rays[:, 2:])
+    assert len(seen[0]) >= 20
+    assert seen[0] == pytest.approx(seen[1], abs=1e-9)
+    assert seen[0] / 0.125 == pytest.approx(np.rint(seen[0] / 0.125), abs=1e-9)

@@ -5,7 +5,7 @@ import pytest
 
 from terrafix.anchor.matching.descriptor_cache import MapFeatures
 from terrafix.anchor.matching.orthorectify import rectify
-from terrafix.anchor.matching.patch_matcher import PatchMatches, correlate_patches, match_patches
+from terrafix.anchor.matching.patch_matcher import PatchMatches, _peaks, correlate_patches, match_patches
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, FlatMap, rotation, texture, view
 
@@ -88,7 +88,7 @@ def test_a_surface_of_a_patch_is_its_zero_mean_normalised_correlation_with_the_m
     window = (1.0 + rng.normal(size=(channels, 50, 60))).astype(np.float32)
     template = (2.0 + rng.normal(size=(channels, 30, 40))).astype(np.float32)
     every = np.ones(template.shape[1:], bool), np.ones(window.shape[1:], bool)
-    corners, surfaces = correlate_patches(template, every[0], window, every[1], patch, radius, row0, column0)
+    corners, _, surfaces = correlate_patches(template, every[0], window, every[1], patch, radius, row0, column0)
     assert len(corners) >= 8 and surfaces.shape == (len(corners), 11, 11)
     for (r, c), surface in zip(corners, surfaces, strict=True):
         ours = template[:, r : r + patch, c : c + patch].astype(float)
@@ -99,3 +99,35 @@ def test_a_surface_of_a_patch_is_its_zero_mean_normalised_correlation_with_the_m
             under -= under.mean(axis=(1, 2), keepdims=True)
             expected = (ours * under).sum() / np.sqrt((ours**2).sum() * (under**2).sum())
             assert surface[dr, dc] == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_weight_of_a_peak_falls_to_zero_where_it_stops_to_count() -> None:
+    """At the border of the search, next to an equal peak, and at the least correlation: a match that is there by the
+    last bit counts as one that is not."""
+
+    def weight(height: float, column: int, other: float = -1.0) -> float:
+        surface = np.zeros((1, 21, 21), np.float32)
+        surface[0, 3:8, 3:8], surface[0, 10, column] = max(other, 0.0), height
+        found = _peaks(surface, np.zeros(2))
+        return float(found.weight.sum())
+
+    assert weight(0.6, 10) == pytest.approx(0.36)
+    assert 0.0 < weight(0.201, 10) < 0.01 * weight(0.3, 10)
+    assert weight(0.6, 19) == 0.0 < weight(0.6, 18) < weight(0.6, 17) == weight(0.6, 10)
+    assert weight(0.6, 10, other=0.59) == 0.0 < weight(0.6, 10, other=0.5)
+
+
+def test_a_patch_at_the_rim_counts_by_how_much_of_it_the_frame_shows() -> None:
+    rng = np.random.default_rng(3)
+    template, window = (rng.normal(size=(2, side, side)).astype(np.float32) for side in (40, 80))
+    mask, valid = np.ones((40, 40), bool), np.ones((80, 80), bool)
+    mask[:, :1] = False
+    centres = np.array([(20.0, 10.0), (20.0, 20.0)])
+    corners, weights, _ = correlate_patches(template, mask, window, valid, 20, 4, 20, 20, centres)
+    assert sorted(corners) == [(10, 10)]  # a twentieth of the other is outside
+    mask[:30, 0] = True
+    corners, weights, _ = correlate_patches(template, mask, window, valid, 20, 4, 20, 20, centres)
+    assert dict(zip(corners, weights.tolist(), strict=True)) == {(10, 0): 1.0, (10, 10): 1.0}
+    mask[17:, 0] = False
+    corners, weights, _ = correlate_patches(template, mask, window, valid, 20, 4, 20, 20, centres)
+    assert dict(zip(corners, weights.tolist(), strict=True))[10, 0] == pytest.approx(1.0 - 13 / 400 / 0.04, abs=1e-3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.anchor.verification.patch_consensus import estimate_consensus
+from terrafix.anchor.verification.patch_consensus import _best_offsets, estimate_consensus
 
 CELL = 0.01  # of the height
 REACH = 16
@@ -81,3 +81,16 @@ def test_random_surfaces_give_little_evidence_and_changed_ground_removes_only_it
     assert min(right) > 2.0 * max(wrong)
     assert min(changed) > max(wrong)
     assert np.mean(right) > np.mean(changed)
+
+
+def test_two_places_of_a_patch_that_are_almost_equally_high_share_it() -> None:
+    """Of the highest cell alone the place would jump from one to the other by the last bit."""
+    z = np.zeros((1, 21, 21), np.float32)
+    found = []
+    for more in (-1e-4, 1e-4):
+        z[0, 10, 8], z[0, 10, 12] = 4.0 - more, 4.0 + more
+        [offset], [value] = _best_offsets(z, z, np.zeros((1, 2)), CELL, 4.0 * CELL)
+        assert value == pytest.approx(4.0, abs=1e-3)
+        found.append(offset)
+    assert found[0] == pytest.approx(found[1], abs=0.01 * CELL)
+    assert found[0] == pytest.approx((0.0, 0.0), abs=0.1 * CELL)
