@@ -87,6 +87,8 @@ def test_a_flight_with_few_matches_is_finalised_with_its_refined_positions(tmp_p
     for pose, row in zip(refined[-1].poses, rows, strict=True):
         assert float(row["lat_deg"]) == pytest.approx(pose.lat_deg, abs=2e-8)
         assert float(row["sigma_e_m"]) == pytest.approx(pose.sigma_e_m, abs=1e-3)
+        # The lens stays as described, 1 % of the focal length, 100 m above the ground.
+        assert float(row["sigma_u_m"]) > 0.9
 
 
 def test_a_summary_of_an_older_version_has_no_line_about_its_solution() -> None:

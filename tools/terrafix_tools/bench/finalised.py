@@ -27,7 +27,7 @@ from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, choose
-from terrafix_tools.finalise.run import Placed, refined_track
+from terrafix_tools.finalise.run import Placed, heights_as_seen, refined_track, solved_track
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Run
 from terrafix_tools.montecarlo.plan import FlightPlan, plan
@@ -79,10 +79,11 @@ def measure(number: int, duration_s: float = DURATION_S) -> dict[str, Any]:
     found = smooth(graph, estimates_lens=choice.estimates_lens)
     cpu_s = time.process_time() - begun_s
     refined = refined_track(graph, flight.replayer.estimators[-1])
-    solved = {frame_id: Placed(found.poses[n], found.covs[n], found.bias[n]) for frame_id, n in graph.node_of.items()}
+    solved = solved_track(graph, found)
     refined_m = np.hypot(*flight.errors(refined)[0][:, :2].T)
     solved_m = np.hypot(*flight.errors(solved)[0][:, :2].T)
-    errors_m, covs = flight.errors(solved if choice.kept else refined)
+    kept = solved if choice.kept else refined
+    errors_m, covs = flight.errors(kept if choice.estimates_lens else heights_as_seen(graph, kept))
     px = graph.origin.camera.fx
     before_px, after_px = (float("nan") if one is None else one * px for one in found.map_residual)
     away_m = np.hypot(*errors_m[:, :2].T)

@@ -5,7 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -148,14 +148,17 @@ def _smoothed(
         return {**summary, "points": 0}, np.zeros(0, VERTEX)
     frame = LocalFrame(flight.origin.lat_deg, flight.origin.lon_deg)
     r_b_c = Mount.of(flight.origin.camera).r_b_c()
-    refined = {} if choice.kept else refined_track(flight, estimator)
+    track = solved_track(flight, found)
+    if not choice.kept:
+        track |= {i: at for i, at in refined_track(flight, estimator).items() if i in track}
+    if not choice.estimates_lens:
+        track = heights_as_seen(flight, track)
     lost: Counter[int] = Counter()
     for frame_id, node in flight.node_of.items():
         if not found.placed[node]:
             lost[int(found.begins[node])] += 1
         elif frame_id in rows:
-            placed = Placed(found.poses[node], found.covs[node], found.bias[node])
-            _fill(rows[frame_id], refined.get(frame_id, placed), frame, r_b_c)
+            _fill(rows[frame_id], track[frame_id], frame, r_b_c)
     why = "no map match is accepted there, and its start is unknown"
     summary = _summary(flight, found, choice, [{"frames": count, "why": why} for count in lost.values()])
     cameras = {frame_id: found.poses[node] for frame_id, node in flight.node_of.items() if found.placed[node]}
@@ -170,6 +173,23 @@ class Placed:
     pose: gtsam.Pose3
     cov: np.ndarray
     bias: np.ndarray
+
+
+def solved_track(flight: FlightGraph, found: Smoothed) -> dict[int, Placed]:
+    """By frame: the batch solution."""
+    return {i: Placed(found.poses[n], found.covs[n], found.bias[n]) for i, n in flight.node_of.items()}
+
+
+def heights_as_seen(flight: FlightGraph, track: dict[int, Placed]) -> dict[int, Placed]:
+    """The covariance with what the description leaves open of the focal length: heights are as seen through it."""
+    seen, camera = dict[int, Placed](), flight.origin.camera
+    for frame_id, at in track.items():
+        up = at.pose.rotation().matrix()[UP]
+        height_m = float(at.pose.translation()[UP]) - (flight.origin.ground_amsl_m or 0.0)
+        cov = at.cov.copy()
+        cov[TRANSLATION, TRANSLATION] += (camera.focal_sigma * height_m) ** 2 * np.outer(up, up)
+        seen[frame_id] = replace(at, cov=cov)
+    return seen
 
 
 def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, Placed]:
