@@ -3,87 +3,27 @@
 The container has the loopback of this computer, where a simulated camera and autopilot fly the shuttle of the soak.
 Needs root, systemd-nspawn (Debian: systemd-container) and debootstrap, and Debian's packages; skipped without them."""
 
-import json
 import os
 import shutil
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from terrafix.processes import PROCESSES
-from terrafix_tools.chaos.camera import StreamedCamera, camera_toml
-from terrafix_tools.chaos.scene import Scene
+from booted_system import NAMES, Booted, Surroundings, do, wait_until
 from terrafix_tools.chaos.shuttle import shuttle_in
-from terrafix_tools.chaos.verdict import back_s, silence_s
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.autopilot.peer import AutopilotPeer
-from terrafix_tools.sim.camera.stream import FrameStream
 
 pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.real_time]
 
 ROOT = Path(__file__).resolve().parents[2]
 SUITE, ARCH = "bookworm", "amd64"
 INCLUDED = ("systemd", "systemd-sysv", "dbus", "python3")
-INSTALL_S, WAIT_S = 1800.0, 300.0  # limits; the machine may be busy
 WATCHDOG_S = 10.0  # WatchdogSec= of the unit
 STOP_S = 45.0  # TimeoutStopSec= of the unit
 ALONE_S = 10.0  # after which a process without a supervisor ends (runtime/adopted_process.py)
 SILENCE_S = 2.0  # without GPS_INPUT; the start of new processes costs more than 4 s
-STEADY_S = 1.0  # with a fix before each fault
-NAMES = {process.name for process in PROCESSES}
-
-
-def do(*command: str | Path, limit_s: float = INSTALL_S) -> str:
-    return subprocess.run([*map(str, command)], check=True, capture_output=True, text=True, timeout=limit_s).stdout
-
-
-class Surroundings:
-    """Camera and autopilot of the shuttle on the loopback of this computer. A context manager."""
-
-    def __init__(self, scene: Scene) -> None:
-        ground = scene.course(0.0)
-        self.scene, self.stream = scene, FrameStream()
-        self.peer = AutopilotPeer(kind=Kind.COPTER, home_amsl_m=ground.amsl_m - ground.agl_m)
-        self._began_s = time.monotonic()
-        self._camera = StreamedCamera(self.stream, scene.jpeg, self._flight_s, scene.frame_hz)
-
-    def __enter__(self) -> "Surroundings":
-        self.port = self.peer.start(0, self.scene.course, self._flight_s)
-        self._camera.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._camera.__exit__()
-        self.stream.close()
-        with suppress(RuntimeError):
-            self.peer.stop()
-
-    def _flight_s(self) -> float:
-        return time.monotonic() - self._began_s
-
-    def settings(self) -> str:
-        start = self.scene.course(self._flight_s())
-        return (
-            f'[source]\npath = "{self.stream.url}"\ncamera = "/etc/terrafix/camera.toml"\n'
-            f'start = "{start.lat_deg:.6f},{start.lon_deg:.6f}"\n[map]\npath = "/var/lib/terrafix/maps/place.gpkg"\n'
-            f'[link]\ndevice = "udpout:127.0.0.1:{self.port}"\n'
-        )
-
-    def has_fix(self, from_s: float) -> bool:
-        """Whether there is a 3D fix, since at least STEADY_S and after ``from_s`` (monotonic)."""
-        now_s = time.monotonic()
-        back = back_s([fix.received_s for fix in self.peer.fixes()[-1000:]], from_s, now_s)
-        return back is not None and now_s - (from_s + back) > STEADY_S
-
-    def silence_s(self, from_s: float) -> float:
-        """Longest time without GPS_INPUT from ``from_s`` to now."""
-        return silence_s(self.peer.received_s, from_s, time.monotonic())
 
 
 @pytest.fixture(scope="module")
@@ -111,92 +51,8 @@ def system(tmp_path_factory: pytest.TempPathFactory, surroundings: Surroundings)
     command.write_text("#!/opt/terrafix/venv/bin/python\nfrom terrafix_tools.program import main\nmain()\n")
     command.chmod(0o755)
     do("sh", ROOT / "systemd" / "install.sh", "--prefix", root, "--no-pip")
-    maps = root / "var" / "lib" / "terrafix" / "maps"
-    maps.mkdir(parents=True)
-    shutil.copy(surroundings.scene.map_path, maps / "place.gpkg")
-    (root / "etc" / "terrafix" / "camera.toml").write_text(camera_toml(surroundings.scene.camera))
-    wanted = root / "etc/systemd/system/multi-user.target.wants"
-    wanted.mkdir(parents=True, exist_ok=True)
-    (wanted / "terrafix.service").symlink_to("/etc/systemd/system/terrafix.service")
+    surroundings.prepare(root)
     return root
-
-
-class Booted:
-    def __init__(self, root: Path, surroundings: Surroundings) -> None:
-        self.around = surroundings
-        self._settings = root / "etc" / "terrafix" / "terrafix.toml"
-        self.start_here()
-        nspawn = ("systemd-nspawn", "--quiet", "-D", str(root), "--register=no", "--keep-unit", "--boot")
-        self.process = subprocess.Popen(
-            [*nspawn, "--console=pipe"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-        )
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        wait_until(lambda: bool(children.read_text().split()), "systemd has not started")
-        self._init = children.read_text().split()[0]
-
-    def end(self) -> None:
-        self.run("systemctl", "poweroff")
-        try:
-            self.process.wait(timeout=WAIT_S)
-        finally:
-            self.process.kill()
-            self.process.wait()
-
-    def run(self, *words: str) -> str:
-        enter = ("nsenter", "-t", self._init, "-m", "-u", "-i", "-n", "-p", "-r", "-w", *words)
-        return subprocess.run(enter, capture_output=True, text=True, timeout=WAIT_S, check=False).stdout
-
-    def start_here(self) -> None:
-        """The next start of a flight that was stopped in order begins where the vehicle is."""
-        self._settings.write_text(self.around.settings())
-
-    def show(self, name: str) -> str:
-        return self.run("systemctl", "show", "terrafix", "-p", name, "--value").strip()
-
-    def wait_for(self, name: str, value: str) -> float:
-        """-> seconds that it took."""
-        began_s = time.monotonic()
-        wait_until(lambda: self.show(name) == value, f"{name} is not {value}")
-        return time.monotonic() - began_s
-
-    def wait_for_fix(self, from_s: float) -> None:
-        wait_until(lambda: self.around.has_fix(from_s), "no fix")
-
-    def processes(self) -> dict[str, int]:
-        """Name and pid of what is in the control group of the unit, without its main process."""
-        groups = "for f in $(grep -ls terrafix.service /proc/[0-9]*/cgroup)"
-        script = f"{groups}; do cd ${{f%/*}} && echo ${{PWD#/proc/}} $(cat comm); done"
-        rows = [line.split() for line in self.run("sh", "-c", script).splitlines()]
-        found = {row[1]: int(row[0]) for row in rows if len(row) > 1}
-        return {name: pid for name, pid in found.items() if str(pid) != self.show("MainPID")}
-
-    def flying(self) -> dict[str, int]:
-        """The processes of a flight that has a fix; waits for it."""
-        self.wait_for("ActiveState", "active")
-        self.wait_for_fix(time.monotonic() - STEADY_S)
-        return {name: pid for name, pid in self.processes().items() if name in NAMES}
-
-    def signal_supervisor(self, name: str) -> None:
-        self.run("systemctl", "kill", "-s", name, "--kill-whom=main", "terrafix")
-
-    def run_folders(self) -> list[str]:
-        return self.run("sh", "-c", "ls -d /dev/shm/terrafix-*").split()
-
-    def of_systemd(self, since_s: float) -> list[str]:
-        """What systemd itself has said about the unit since a time of the wall clock."""
-        entries = (e for e in self.journal() if int(e["__REALTIME_TIMESTAMP"]) > 1e6 * since_s)
-        return [str(entry["MESSAGE"]) for entry in entries if entry["SYSLOG_IDENTIFIER"] == "systemd"]
-
-    def journal(self) -> list[Any]:
-        lines = self.run("journalctl", "-u", "terrafix", "-o", "json", "--no-pager").splitlines()
-        return [json.loads(line) for line in lines]
-
-
-def wait_until(reached: Callable[[], bool], otherwise: str, limit_s: float = WAIT_S) -> None:
-    until = time.monotonic() + limit_s
-    while not reached():
-        assert time.monotonic() < until, otherwise
-        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")

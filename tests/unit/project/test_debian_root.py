@@ -40,6 +40,6 @@ def test_a_finished_root_stays_and_other_packages_are_another_root(tmp_path: Pat
     assert debian_root("bookworm", "amd64", tmp_path, "gcc").returncode == 1
 
 
-def test_both_scripts_are_shell() -> None:
-    for name in ("debian-root", "in-root"):
+def test_the_scripts_are_shell() -> None:
+    for name in ("arm64", "debian-root", "in-root"):
         assert subprocess.run(["sh", "-n", SCRIPT.with_name(name)], timeout=60, check=False).returncode == 0

@@ -4,7 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
-from terrafix.vision.repeated_picture import HISTORY, MAX_SHIFT_PX, WIDTH_PX, PictureHistory, Repeat, same_view
+from terrafix.vision.repeated_picture import (
+    HISTORY,
+    MAX_SHIFT_PX,
+    WIDTH_PX,
+    PictureHistory,
+    Repeat,
+    normal_equations,
+    same_view,
+)
 
 SIDE = 720
 
@@ -124,3 +132,16 @@ def test_two_alternating_buffers_are_detected_at_the_third_image() -> None:
 def test_images_of_different_size_are_not_the_same_view() -> None:
     still = view(ground(1), 10.0)
     assert looks([noisy(still, 1), noisy(still[:400], 2)]) == [Repeat.NONE, Repeat.NONE]
+
+
+def test_the_normal_equations_are_exact_so_that_all_processors_agree() -> None:
+    """Steps between black and white, the largest gradients that there are: the sums are those of whole numbers."""
+    rng = np.random.default_rng(10)
+    before, now = (rng.choice([0, 255], (120, 180)).astype(np.float32) for _ in range(2))
+    gradient = np.stack([cv2.Scharr(before, cv2.CV_32F, x, 1 - x, scale=1 / 32).ravel() for x in (1, 0)])
+    whole, difference = (32 * gradient).astype(np.int64), (now - before).astype(np.int64).ravel()
+    assert np.abs(whole).max() > 4000 and np.array_equal(whole, 32 * gradient)
+    with np.errstate(all="raise"):
+        normal, right = normal_equations(gradient, (now - before).ravel())
+    assert np.array_equal(normal * 1024, whole @ whole.T)
+    assert np.array_equal(right * 32, whole @ difference)
