@@ -35,7 +35,8 @@ INCLUDED = ("systemd", "systemd-sysv", "dbus", "python3", "python3-venv")
 GLIBC_MINOR = 36  # of the suite: wheels for an older glibc run on it
 PROCESSOR = "cortex-a76"  # the class of an Orin: no SVE
 FAST_TESTS = ("core", "engines", "link", "recorder", "estimator")  # folders of tests/unit
-NOT_EMULATED = ("page_faults", "memory_is_returned", "free_memory_is_returned")  # they measure the emulator's memory
+# They measure the memory of the emulator, and count its threads.
+NOT_EMULATED = ("page_faults", "memory_is_returned", "free_memory_is_returned", "the_link_gets_real_time_priority")
 FRAMES = 20  # of village-1
 MAX_APART_M = 0.5  # between the two processors, at any frame
 SLOWER = 8.0  # times, of the shuttle: an image each 4 s; a camera without one for 5 s counts as lost
