@@ -80,9 +80,9 @@ def test_the_demo_sends_gps_input_without_gaps_and_writes_its_report(
 
 @pytest.mark.slow
 def test_killed_processes_are_restarted_and_gps_input_continues(tmp_path: Path, stall_ms: Callable[[], float]) -> None:
-    """One after the other, the link last: the largest gap of GPS_INPUT is that of its restart, and the death of the
+    """One after the other, the link first: the largest gap of GPS_INPUT is that of its restart, and the death of the
     others, on which the link does not depend, makes none."""
-    out, victims = tmp_path / "demo", ("estimator", "anchor", "vision", "link")
+    out, victims = tmp_path / "demo", ("link", "estimator", "anchor", "vision")
     with subprocess.Popen(
         [*COMMAND, "--out", str(out), "--duration", str(DURATION_S)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     ) as running:
