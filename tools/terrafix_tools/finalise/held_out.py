@@ -109,17 +109,20 @@ def _estimated(flight: FlightGraph, progress: Progress) -> Smoothed | None:
     return found if determined else None
 
 
+def _comparable(flight: FlightGraph) -> list[Fix]:
+    """The held-out matches of which PnP has accepted points: a match that gave a pose itself has none."""
+    return [fix for fix in flight.held_out if fix.points is not None and fix.points.accepted().any()]
+
+
 def _smoothed_px(flight: FlightGraph, found: Smoothed) -> np.ndarray:
-    """(F,) error of each held-out match with points, by the solution."""
-    fixes = [fix for fix in flight.held_out if fix.points is not None]
-    return np.array([_off_px(flight, fix, found.on_map(fix), found.lens_at(fix.node)) for fix in fixes])
+    """(F,) error of each comparable match, by the solution."""
+    return np.array([_off_px(flight, f, found.on_map(f), found.lens_at(f.node)) for f in _comparable(flight)])
 
 
 def _in_flight_px(flight: FlightGraph) -> np.ndarray:
     """(F,) ... by the last estimates in flight, whose lens is the described one with the newest radial coefficient."""
     lens, nodes = Lens(flight.radial_k1[0]), flight.recorder.nodes
-    fixes = [fix for fix in flight.held_out if fix.points is not None]
-    return np.array([_off_px(flight, fix, nodes[fix.node].state.pose, lens) for fix in fixes])
+    return np.array([_off_px(flight, f, nodes[f.node].state.pose, lens) for f in _comparable(flight)])
 
 
 def _off_px(flight: FlightGraph, fix: Fix, pose: gtsam.Pose3, lens: Lens) -> float:
