@@ -34,6 +34,14 @@ def data_set(data_dir: Path) -> Callable[[str], Path]:
     return find
 
 
+@pytest.fixture(scope="session", autouse=True)
+def state_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What a test leaves for the next start is not found by another flight on this computer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STATE_DIRECTORY", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 # Sleeps 5 ms again and again, and prints the longest delay of a wake-up [ms] when its input ends.
 SLEEPER = """
 import select, sys, time

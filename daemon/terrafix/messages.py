@@ -728,10 +728,12 @@ class MapOffset(Message, frozen=True, kw_only=True):
 
 
 class PositionSource(Message, frozen=True, kw_only=True):
-    """Command to the autopilot to navigate by Terrafix (``vision``), or by its GNSS ``receiver`` again."""
+    """Command to the autopilot to navigate by Terrafix (``vision``), or by what it had before, with its GNSS
+    ``receiver``, again."""
 
     vision: bool
     receiver: int
+    fallback: bool = True  # the autopilot may use its receiver while Terrafix sends no 3D fix
 
 
 class EkfStatus(Message, frozen=True, kw_only=True):

@@ -32,6 +32,7 @@ class NodeContext:
     out_dir: Path  # output folder of the recorder
     ground_amsl_m: float | None = None  # ground height of the map at the initial position, for sources without one
     checkpoint: Path | None = None  # checkpoint file in shared memory, read by the next instance of this process
+    state_dir: Path | None = None  # folder on disk for what the next start must know (core/state_folder.py)
     cache_dir: Path | None = None  # folder in shared memory for recomputable results; it need not exist
     epoch_ns: int | None = None  # t_ns of the first Origin of this run; set when the source process is restarted
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core import clock
 from terrafix.core.clock import NS_PER_S
 from terrafix.core.config import LinkSection
 from terrafix.link.admission.packet_filter import Admission
@@ -16,6 +17,7 @@ from terrafix.link.autopilot.autopilot_prior import AutopilotPrior
 from terrafix.link.autopilot.checkpoint import CheckpointWriter
 from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder
 from terrafix.link.autopilot.packet_decoder import AutopilotPeer
+from terrafix.link.gnss.previous_source import PreviousSourceFile
 from terrafix.link.gnss.source_switch import SourceSwitch
 from terrafix.link.ground_station.links import GroundLinks
 from terrafix.link.ground_station.named_values import NamedValues
@@ -51,15 +53,25 @@ WALL_CLOCK_NS = 10 * NS_PER_S  # [tuned]
 TIMESYNC_NS = NS_PER_S
 FAST_TIMESYNC_NS = 100_000_000  # until FAST_TIMESYNC_COUNT responses have arrived [tuned]
 FAST_TIMESYNC_COUNT = 10  # [tuned]
+RESTORE_NS = (
+    2 * NS_PER_S
+)  # longest wait for the autopilot at an ordered stop [spec: runtime/supervisor.py ends it after 5 s]
+RESTORE_POLL_S = 0.02  # [spec: tick rate of the link, processes.py]
 
 
-def open_edge(config: LinkSection, checkpoint_file: Path | None = None) -> "MavlinkEdge":
-    """Opens the device of the configuration. ``checkpoint_file``: see ``CheckpointWriter``.
+def open_edge(config: LinkSection, checkpoint_file: Path | None = None, state_dir: Path | None = None) -> "MavlinkEdge":
+    """Opens the device of the configuration. ``checkpoint_file``: see ``CheckpointWriter``. ``state_dir``: see
+    ``PreviousSourceFile``.
 
     Raises LinkError with advice when the device cannot be opened, ConfigError when the signing key cannot be used."""
     transport = open_at_start(config.device, config.baud)
     return MavlinkEdge(
-        config, transport, time.time_ns, on_status=StatusLog().log, checkpoint_writer=CheckpointWriter(checkpoint_file)
+        config,
+        transport,
+        time.time_ns,
+        on_status=StatusLog().log,
+        checkpoint_writer=CheckpointWriter(checkpoint_file),
+        previous_source=PreviousSourceFile(state_dir),
     )
 
 
@@ -74,6 +86,7 @@ class MavlinkEdge:
         *,
         on_status: Callable[[LinkStatus], None] = lambda _: None,
         checkpoint_writer: CheckpointWriter | None = None,
+        previous_source: PreviousSourceFile | None = None,
     ) -> None:
         """``wall_clock_ns``: Unix time of this computer. ``on_status`` is called with every LinkStatus, for the log."""
         self._checkpoint = checkpoint_writer or CheckpointWriter(None)
@@ -95,7 +108,7 @@ class MavlinkEdge:
         self._serial_outputs = open_serial_outputs(config)
         self._hints = HintReceiver(config.sysid, config.compid)
         self._ground = GroundLinks(config, wall_clock_ns, self._hints)
-        self._switch = SourceSwitch(config.gps_id)
+        self._switch = SourceSwitch(config.gps_id, previous_source)
         self._autopilot_prior = AutopilotPrior()
         self._dead_reckoning = DeadReckoningRecorder(
             None if checkpoint is None else checkpoint.last, self._autopilot.telemetry.measured_ns
@@ -175,10 +188,26 @@ class MavlinkEdge:
                 self._send_to_all(mavlink.MAVLink_statustext_message(message.severity, text))
 
     def close(self) -> None:
+        self._restore_source()
         self._connection.close()
         self._ground.close()
         for output in self._serial_outputs:
             output.close()
+
+    def _restore_source(self) -> None:
+        """Before an ordered stop: the autopilot gets back what it navigated by before it was switched to us. What it
+        does not confirm in RESTORE_S is left to the next start."""
+        if not self._switch.switched:
+            return
+        begun_ns = clock.now_ns()
+        self._switch.set_target(PositionSource(t_ns=begun_ns, vision=False, receiver=0), ())
+        while self._switch.switched and (now_ns := clock.now_ns()) - begun_ns < RESTORE_NS:
+            for request in self._switch.requests(self._served.sysid, now_ns):
+                self._send(request)
+            time.sleep(RESTORE_POLL_S)
+            for message, sender in self._connection.messages(now_ns):
+                if self._admission.classify(message, sender, now_ns) is Role.AUTOPILOT:
+                    self._switch.on_message(message)
 
     def _due(self, task: str, period_ns: int, now_ns: int) -> bool:
         """True if the periodic task is due; it is then due again after ``period_ns``."""

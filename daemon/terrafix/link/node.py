@@ -12,6 +12,7 @@ from terrafix.link.autopilot.ekf_status_monitor import EkfStatusMonitor
 from terrafix.link.gnss.initial_position import GnssInitializer
 from terrafix.link.gnss.map_registration import MapOffsetEstimator
 from terrafix.link.gnss.monitor import GnssMonitor
+from terrafix.link.gnss.previous_source import PreviousSourceFile
 from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.link.integrity import fix_type
 from terrafix.link.integrity.estimate_gate import EstimateGate
@@ -48,11 +49,15 @@ NO_FRAME_ID = -1  # frame_id of a verdict that belongs to no frame [spec: Measur
 
 
 def make_node(ctx: NodeContext) -> "LinkNode":
-    """The node, with map offset and clock of the checkpoint after a restart in flight."""
+    """The node, with map offset and clock of the checkpoint after a restart in flight, and the source of position that
+    an earlier process has selected."""
     link, checkpoint = ctx.config.link, load_checkpoint(ctx.checkpoint)
     offsets = MapOffsetEstimator(None if checkpoint is None else checkpoint.map_offset) if link.map_offset else None
     clock = LatchedClock(None if checkpoint is None else checkpoint.unix_minus_monotonic_ns)
-    return LinkNode(link.rate_hz, link.gnss, gnss_start=link.gnss_start, map_offsets=offsets, clock=clock)
+    on_vision = PreviousSourceFile(ctx.state_dir).load() is not None
+    return LinkNode(
+        link.rate_hz, link.gnss, gnss_start=link.gnss_start, map_offsets=offsets, clock=clock, on_vision=on_vision
+    )
 
 
 def make_edge(ctx: NodeContext) -> Edge:
@@ -61,14 +66,14 @@ def make_edge(ctx: NodeContext) -> Edge:
     from terrafix.link.edge import open_edge  # replay has no edge and need not load MAVLink
     from terrafix.link.output.realtime_priority import set_realtime_priority
 
-    edge = open_edge(ctx.config.link, ctx.checkpoint)
+    edge = open_edge(ctx.config.link, ctx.checkpoint, ctx.state_dir)
     set_realtime_priority()
     return edge
 
 
 class LinkNode:
     """Receives estimates, publishes GpsInput at ``rate_hz``. ``map_offsets`` None: the map offset is not estimated.
-    ``clock``: from the checkpoint of the previous link process of this flight."""
+    ``clock``: from the checkpoint of the previous link process of this flight. ``on_vision``: see GnssMonitor."""
 
     def __init__(
         self,
@@ -78,12 +83,13 @@ class LinkNode:
         gnss_start: bool = True,
         map_offsets: MapOffsetEstimator | None = None,
         clock: LatchedClock | None = None,
+        on_vision: bool = False,
     ) -> None:
         self._schedule = SendSchedule(rate_hz, TICK_HZ)
         self._gate = EstimateGate()
         self._fix_gate = fix_type.FixGate()
         self._inertial = InertialBuffer()
-        self._gnss = GnssMonitor(gnss, map_offsets)
+        self._gnss = GnssMonitor(gnss, map_offsets, on_vision=on_vision)
         self._starts = GnssInitializer(enabled=gnss_start)
         self._prior_request = PriorRequest()
         self._ekf_monitor = EkfStatusMonitor()

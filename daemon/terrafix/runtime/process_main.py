@@ -20,6 +20,7 @@ from terrafix.core import logs
 from terrafix.core.errors import TerrafixError
 from terrafix.core.frames import SharedFrameStore
 from terrafix.core.node import NodeContext
+from terrafix.core.state_folder import state_folder
 from terrafix.messages import Frame
 from terrafix.runtime import systemd
 from terrafix.runtime.adopted_process import AloneForTooLong, outlive_supervisor
@@ -96,6 +97,7 @@ def run(name: str, run_dir: RunDir, supervisor_pid: int) -> int:
         out_dir=Path(spec.out_dir),
         ground_amsl_m=spec.ground_amsl_m,
         checkpoint=run_dir.checkpoint(name),
+        state_dir=state_folder(),
         cache_dir=run_dir.cache_dir(name),
         epoch_ns=run_dir.epoch_ns,
     )

@@ -14,6 +14,7 @@ from terrafix.link.gnss.spoofing_detector import (
     Assessment,
     SpoofingDetector,
 )
+from terrafix.link.integrity.fix_type import SILENCE_AFTER_NS
 from terrafix.link.integrity.output_predictor import InertialBuffer, PredictedState, distance_m, predict_to
 from terrafix.link.pilot_text.statustext import CRITICAL, INFO, NOTICE, WARNING, statustext
 from terrafix.messages import (
@@ -33,6 +34,9 @@ OWN_STEP_MEMORY_NS = 10 * NS_PER_S
 MIN_FIX_DURATION_NS = 2 * NS_PER_S  # ns with a 3D fix of ours before the autopilot is switched to it [tuned]
 MIN_VISION_NS = 30 * NS_PER_S  # ns on our position before a switch back [tuned]
 MIN_GNSS_NS = 5 * NS_PER_S  # ns on the receiver before a further switch; short, for repeated spoofing [tuned]
+# ns without a 3D fix of ours for which the autopilot must not use a spoofed receiver. Its EKF rejects that position for
+# 7 s and is then reset to it; a gap shorter than the first one costs no parameter. [measured: docs/autopilot-facts.md]
+LOCKOUT_NS = (NS_PER_S, SILENCE_AFTER_NS)
 MIN_REPORTED_OFFSET_M = 3.0  # m; smaller map offsets are not reported to the pilot [tuned]
 UNUSABLE_STATES = (GnssState.LOST, GnssState.SPOOFED)
 
@@ -41,8 +45,11 @@ class GnssMonitor:
     """``on_estimate`` for each accepted estimate, ``on_reading`` for each reading of a receiver, ``tick`` at every
     transmission."""
 
-    def __init__(self, mode: GnssMode, map_offsets: MapOffsetEstimator | None = None) -> None:
-        """``map_offsets`` None: the map offset is not estimated."""
+    def __init__(
+        self, mode: GnssMode, map_offsets: MapOffsetEstimator | None = None, *, on_vision: bool = False
+    ) -> None:
+        """``map_offsets`` None: the map offset is not estimated. ``on_vision``: an earlier link process switched the
+        autopilot to our position, and nothing has switched it back."""
         self._mode = mode
         self._map_offsets = map_offsets
         self._offset_reported = False
@@ -51,8 +58,10 @@ class GnssMonitor:
         self._estimate: NavEstimate | None = None
         self._own_steps: deque[tuple[int, float]] = deque()  # (t_ns, step [m]) of the estimate
         self._fix_since_ns: int | None = None
+        self._last_fix_ns: int | None = None
         self._armed: bool | None = None
-        self._on_vision = False
+        self._on_vision = on_vision
+        self._fallback = True  # the autopilot may use its receiver while we send no fix
         self._switched_ns: int | None = None
 
     def on_estimate(self, estimate: NavEstimate, inertial: InertialBuffer) -> None:
@@ -87,13 +96,17 @@ class GnssMonitor:
 
     def tick(self, now_ns: int, *, has_fix: bool) -> Iterator[Message]:
         """``has_fix``: a 3D fix is sent now."""
+        self._fix_since_ns = (self._fix_since_ns or now_ns) if has_fix else None
+        self._last_fix_ns = now_ns if has_fix else self._last_fix_ns
+        if self._on_vision and (self._armed is False or self._mode != "act"):
+            yield from self._select(now_ns, vision=False)
         if self._mode == "off":
             return
-        self._fix_since_ns = (self._fix_since_ns or now_ns) if has_fix else None
         for receiver, detector in self._detectors.items():
             yield from self._publish(receiver, detector.check_timeout(now_ns), now_ns)
         if self._mode == "act" and self._detectors:
             yield from self._switch(now_ns)
+            yield from self._lock_out(now_ns)
 
     def _vision_at_reading(self, now_ns: int, inertial: InertialBuffer) -> PredictedState | None:
         """Our estimate at the time of a reading that arrives now; None when it is too old or too uncertain. Before the
@@ -149,14 +162,31 @@ class GnssMonitor:
         if self._armed is False or (self._switched_ns is not None and now_ns - self._switched_ns < wait_ns):
             return
         states = [detector.assessment.state for detector in self._detectors.values()]
-        own_fix = self._fix_since_ns is not None and now_ns - self._fix_since_ns >= MIN_FIX_DURATION_NS
-        if not self._on_vision and own_fix and all(state in UNUSABLE_STATES for state in states):
+        if not self._on_vision and self._own_fix(now_ns) and all(state in UNUSABLE_STATES for state in states):
             yield from self._select(now_ns, vision=True)
         elif self._on_vision and any(state is GnssState.TRUSTED for state in states):
             yield from self._select(now_ns, vision=False)
 
+    def _lock_out(self, now_ns: int) -> Iterator[Message]:
+        """While we are without a fix and a receiver is spoofed, the autopilot must not fall back to it."""
+        if not self._on_vision or self._last_fix_ns is None:
+            return
+        without_fix_ns = now_ns - self._last_fix_ns
+        spoofed = any(detector.assessment.state is GnssState.SPOOFED for detector in self._detectors.values())
+        if self._fallback and spoofed and LOCKOUT_NS[0] <= without_fix_ns < LOCKOUT_NS[1]:
+            self._fallback = False
+        elif not self._fallback and (self._own_fix(now_ns) or not spoofed or without_fix_ns >= LOCKOUT_NS[1]):
+            self._fallback = True
+        else:
+            return
+        yield PositionSource(t_ns=now_ns, vision=True, receiver=0, fallback=self._fallback)
+
+    def _own_fix(self, now_ns: int) -> bool:
+        """Whether we have had a fix for some time."""
+        return self._fix_since_ns is not None and now_ns - self._fix_since_ns >= MIN_FIX_DURATION_NS
+
     def _select(self, now_ns: int, *, vision: bool) -> Iterator[Message]:
-        self._on_vision, self._switched_ns = vision, now_ns
+        self._on_vision, self._switched_ns, self._fallback = vision, now_ns, True
         receiver = next((n for n, d in self._detectors.items() if d.assessment.state is GnssState.TRUSTED), 0)
         yield PositionSource(t_ns=now_ns, vision=vision, receiver=receiver)
         yield statustext(now_ns, NOTICE, f"position source: {'map' if vision else 'GPS'}")

@@ -7,19 +7,16 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from autopilot_rig import FRAME, Rig, at_5_hz, real_fix
 from gnss_rig import accurate, feed_receiver, reading
-from link_rig import LAT, LON, MS, S, estimate
+from link_rig import MS, S, estimate
 from link_wire import MemoryWire, heartbeat, packed
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.autopilot.gnss_receiver import gnss_reading
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.gnss.monitor import MIN_VISION_NS
-from terrafix.link.mavlink.transport import Address
 from terrafix.link.node import LinkNode
 from terrafix.messages import GnssState
-from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
 from terrafix_tools.sim.gnss_evaluation.flight import Vision, fly
 from terrafix_tools.sim.gnss_evaluation.table import summary, table
 
@@ -214,81 +211,6 @@ def test_our_own_gps_input_is_not_read_as_a_receiver(changes: dict[str, Any], re
     second = mavlink.MAVLink_gps2_raw_message(1, 3, 1, 2, 3, 4, 5, 6, 7, 8, 0, 0)
     wire.arrive(*(packed(message, autopilot) for message in (heartbeat(), gps_raw(), second)))
     assert [x.receiver for x in edge.poll(0) if isinstance(x, m.GnssReading)] == receivers
-
-
-def test_a_source_set_is_requested_until_the_autopilot_confirms_it() -> None:
-    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
-    edge = MavlinkEdge(LinkSection(outputs=["odometry"]), wire, lambda: 0)
-    wire.arrive(packed(heartbeat(), autopilot))
-    list(edge.poll(0))
-    edge.on_message(m.PositionSource(t_ns=0, vision=True, receiver=0))
-
-    def requested(second: int) -> list[float]:
-        wire.arrive(packed(heartbeat(), autopilot))
-        list(edge.poll(second * S))
-        command = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
-        return [x.param1 for x in wire.take("COMMAND_LONG") if x.command == command]
-
-    assert [requested(1), requested(2)] == [[2.0], [2.0]]
-    wire.arrive(packed(mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 0), autopilot))
-    list(edge.poll(2 * S + 1))
-    assert [requested(3), requested(4)] == [[], []]
-    edge.on_message(m.PositionSource(t_ns=0, vision=False, receiver=0))
-    assert [requested(second)[:1] for second in range(5, 10)] == [[1.0]] * 5  # without an answer
-    wire.arrive(packed(heartbeat(), autopilot))
-    (status,) = [x for x in edge.poll(11 * S) if isinstance(x, m.LinkStatus)]
-    assert "did not switch" in status.detail
-
-
-class RigWire(MemoryWire):
-    """Connects the real edge with the simulated autopilot; the rig reads the autopilot's packets too."""
-
-    def __init__(self, rig: Rig) -> None:
-        super().__init__()
-        self._rig, transmit = rig, rig.autopilot.transmit
-
-        def tapped() -> bytes:
-            packets = transmit()
-            self.arrive(packets)
-            return packets
-
-        rig.autopilot.transmit = tapped  # type: ignore[method-assign]
-
-    def write(self, packet: bytes, to: Address | None = None) -> bool:
-        self._rig.autopilot.receive(packet, self._rig.t_s)
-        return True
-
-
-def test_an_autopilot_with_a_spoofed_receiver_is_switched_to_gps_input() -> None:
-    """Two GPS: the real one jumps 20 m in flight, which the filter would accept. GPS_INPUT is GPS2."""
-    spoofed_at_s = 15.0
-    spoofed_lat_lon = FRAME.to_wgs84(0.0, 20.0)
-    rig = Rig(
-        Kind.COPTER,
-        parameters=BESIDE_A_RECEIVER | {"GPS1_TYPE": 1.0, "GPS1_DELAY_MS": 5.0},
-        real_gps=at_5_hz(lambda t: real_fix(*spoofed_lat_lon) if t > spoofed_at_s else real_fix()),
-    )
-    edge = MavlinkEdge(LinkSection(gps_id=1, gnss="act"), RigWire(rig), lambda: 0)
-    node = LinkNode(10.0, "act")
-    published: list[m.Message] = []
-    for step in range(22 * 50):
-        rig.fly(0.02)
-        now_ns = round(rig.t_s * S)
-        messages = list(edge.poll(now_ns))
-        if step % 25 == 0:
-            still = estimate(now_ns, velocity_enu_mps=(0.0, 0.0, 0.0), sigma_m=1.5)
-            messages.append(msgspec.structs.replace(still, lat_deg=LAT, lon_deg=LON))
-        for message in messages:
-            for answer in node.on(message):
-                published.append(answer)
-                edge.on_message(answer)
-        for answer in node.tick(now_ns):
-            published.append(answer)
-            edge.on_message(answer)
-    assert rig.autopilot.used_gps == 1
-    assert rig.autopilot.parameters["GPS_AUTO_SWITCH"] == 0.0
-    assert rig.error_m() < 8.0
-    assert [x.vision for x in published if isinstance(x, m.PositionSource)] == [True]
 
 
 # --- flights without images ---
