@@ -172,6 +172,48 @@ def test_an_accuracy_spike_lowers_the_fix_instead_of_opening_the_gate() -> None:
     assert min(g.horiz_accuracy_m for g in late) >= 30.0
 
 
+GAP_S = 20
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "speed_mps", "reason", "until_s"),
+    [
+        (lambda after_s: 8.0 - 4.0 * after_s, 0.5, "first accuracy", 0.5),
+        (lambda _: 12.0, 0.5, "first accuracy", 1.2),  # a coarse map is not better later
+        (lambda _: 4.0, 1.35, "speed accuracy", 10.0),
+    ],
+)
+def test_after_a_gap_the_first_accuracy_is_one_that_opens_the_alignment_checks(
+    sigma_m: Callable[[float], float], speed_mps: float, reason: str, until_s: float
+) -> None:
+    """The firmware judges by the first sample after 5 s without a 3D fix (test_fact_after_20_s...)."""
+    back_ns = (10 + GAP_S) * S
+
+    def make(t: int) -> m.NavEstimate:
+        after_s = (t - back_ns) / S
+        return estimate(t, sigma_m=max(4.0, sigma_m(after_s)), velocity_sigma=speed_mps)
+
+    node = LinkNode(10.0)
+    fly(node, 0, 10 * S, every(100 * MS, lambda t: estimate(t, sigma_m=3.0)))
+    fly(node, 10 * S, back_ns, lambda _: [])
+    sent = gps(fly(node, back_ns, back_ns + 10 * S, every(100 * MS, make)))
+    waits = [g for g in sent if g.t_ns > back_ns + 200 * MS and g.fix_type == 1]
+    assert waits
+    assert all(reason in g.no_fix_reason for g in waits)
+    assert (waits[-1].t_ns - back_ns) / S <= until_s + 0.2
+    again = [g for g in sent if g.t_ns > back_ns and g.fix_type == 3]
+    assert not again or again[0].speed_accuracy_mps <= 1.3
+    assert bool(again) is (until_s < 10.0)
+
+
+def test_after_a_gap_below_5_s_no_better_accuracy_is_awaited() -> None:
+    node = LinkNode(10.0)
+    fly(node, 0, 10 * S, every(100 * MS, lambda t: estimate(t, sigma_m=3.0)))
+    fly(node, 10 * S, 14 * S, lambda _: [])
+    sent = gps(fly(node, 14 * S, 16 * S, every(100 * MS, lambda t: estimate(t, sigma_m=8.0, velocity_sigma=1.35))))
+    assert {g.fix_type for g in sent if g.t_ns > 14_300 * MS} == {3}
+
+
 # --- jumps ---
 
 

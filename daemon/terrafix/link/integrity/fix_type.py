@@ -27,6 +27,16 @@ RECOVERY_SPEED_SIGMA_MPS = 1.45  # m/s; hysteresis, as above [tuned]
 SPIKE_RATIO = 3.0  # accuracy over the last one that was sent [tuned]
 SPIKE_MIN_M = 15.0  # m; smaller accuracies are no spike [tuned]
 SPIKE_HOLD_NS = 2_000_000_000  # ns of no fix before the larger accuracy is reported [tuned]
+# After 5 s without a 3D fix the first sample decides the alignment checks of the EKF, which a filter that has stopped
+# aiding needs: if it fails, only 10 s without a failure at the narrower limits of 5 m and 1 m/s open them again (EKF3,
+# AP_NavEKF3_VehicleStatus.cpp, calcGpsGoodToAlign, at EK3_CHECK_SCALE 100). The peak hold has forgotten all by then.
+ALIGNMENT_GAP_NS = 5_000_000_000  # ns [spec: ArduPilot calcGpsGoodToAlign]
+FIRST_HORIZONTAL_M = 6.5  # m; 1.3 times 5 m [spec: ArduPilot calcGpsGoodToAlign]
+FIRST_SPEED_SIGMA_MPS = (
+    1.29  # m/s; 1.3 times 1 m/s, less the rounding of both sides [spec: ArduPilot calcGpsGoodToAlign]
+)
+# ns for which a better first accuracy is awaited; not longer, because the recommended EK3_GPS_CHECK ignores it. [tuned]
+FIRST_WAIT_NS = 1_000_000_000
 MIN_HORIZONTAL_ACCURACY_M = 0.5  # m; lower limit in the EKF [spec: ArduPilot EK3_POSNE_M_NSE]
 MAX_ACCURACY_M = 100.0  # m; upper limit in the EKF [measured: docs/autopilot-facts.md]
 MIN_SPEED_ACCURACY_MPS = 0.1  # m/s, in the worst direction [tuned]
@@ -53,12 +63,12 @@ STARTED_IN_FLIGHT = NoFixReason("started in flight, and no map fix yet", "the ma
 
 
 class FixGate:
-    """Decides the fix type at every transmission. Its state: hysteresis, and the spike hold."""
+    """Decides the fix type at every transmission. Its state: hysteresis, and the wait for a better accuracy."""
 
     def __init__(self) -> None:
         self.has_fix = False
-        self._sent_accuracy_m: float | None = None  # last horizontal accuracy that was sent with a 3D fix
-        self._spike_since_ns: int | None = None
+        self._sent: tuple[int, float] | None = None  # ns, m: time and horizontal accuracy of the last 3D fix
+        self._awaited_since_ns: int | None = None  # since when the accuracy is worse than the autopilot takes well
 
     def withdraw(self) -> None:
         """No fix now, for a reason outside of this gate."""
@@ -73,7 +83,7 @@ class FixGate:
         reason = self._no_fix_reason(predicted, accuracy_m, level, label)
         self.has_fix = reason is None
         if self.has_fix:
-            self._sent_accuracy_m = accuracy_m
+            self._sent = predicted.t_ns, accuracy_m
         return reason
 
     def _no_fix_reason(
@@ -89,23 +99,33 @@ class FixGate:
             return NoFixReason(
                 f"accuracy {accuracy_m:.0f} m is worse than {limit_m:.0f} m", f"worse than {limit_m:.0f} m"
             )
-        limit_mps = MAX_SENT_VELOCITY_SIGMA_MPS if self.has_fix else RECOVERY_SPEED_SIGMA_MPS
+        after_gap = self._sent is not None and predicted.t_ns - self._sent[0] >= ALIGNMENT_GAP_NS
+        recovery_mps = FIRST_SPEED_SIGMA_MPS if after_gap else RECOVERY_SPEED_SIGMA_MPS
+        limit_mps = MAX_SENT_VELOCITY_SIGMA_MPS if self.has_fix else recovery_mps
         if predicted.speed_sigma_mps > limit_mps:
             text = f"speed accuracy {predicted.speed_sigma_mps:.1f} m/s is worse than {limit_mps:.1f} m/s"
             return NoFixReason(text, "the speed is too uncertain")
-        return self._accuracy_spike(predicted.t_ns, accuracy_m)
+        return self._await_accuracy(predicted.t_ns, accuracy_m, after_gap=after_gap)
 
-    def _accuracy_spike(self, now_ns: int, accuracy_m: float) -> NoFixReason | None:
-        before_m = self._sent_accuracy_m
-        if before_m is None or accuracy_m <= max(SPIKE_MIN_M, SPIKE_RATIO * before_m):
-            self._spike_since_ns = None
+    def _await_accuracy(self, now_ns: int, accuracy_m: float, *, after_gap: bool) -> NoFixReason | None:
+        """An accuracy that the autopilot would take badly is reported only if it lasts."""
+        if self._sent is None:
             return None
-        if self._spike_since_ns is None:
-            self._spike_since_ns = now_ns
-        if now_ns - self._spike_since_ns >= SPIKE_HOLD_NS:
-            self._spike_since_ns = None
+        before_m = self._sent[1]
+        limit_m, wait_ns = max(SPIKE_MIN_M, SPIKE_RATIO * before_m), SPIKE_HOLD_NS
+        text, short = f"accuracy went from {before_m:.0f} to {accuracy_m:.0f} m at once", "suddenly less accurate"
+        if after_gap:
+            limit_m, wait_ns = FIRST_HORIZONTAL_M, FIRST_WAIT_NS
+            text, short = f"first accuracy after a gap, {accuracy_m:.1f} m", "awaiting a better accuracy"
+        if accuracy_m <= limit_m:
+            self._awaited_since_ns = None
             return None
-        return NoFixReason(f"accuracy went from {before_m:.0f} to {accuracy_m:.0f} m at once", "suddenly less accurate")
+        if self._awaited_since_ns is None:
+            self._awaited_since_ns = now_ns
+        if now_ns - self._awaited_since_ns >= wait_ns:
+            self._awaited_since_ns = None
+            return None
+        return NoFixReason(text, short)
 
 
 def reported_accuracy(predicted: PredictedState, level: int) -> tuple[float, float, float]:

@@ -181,6 +181,44 @@ def test_fact_a_gap_of_12_s_lands_a_copter() -> None:
     assert rig.autopilot.status.failsafes == 1
 
 
+@pytest.mark.parametrize(
+    ("check", "first", "used_again"),
+    [
+        (31.0, {"hacc": 6.6}, False),
+        (31.0, {"hacc": 6.4}, True),
+        (23.0, {"hacc": 6.6}, True),
+        (23.0, {"sacc": 1.31}, False),
+        (23.0, {"sacc": 1.29}, True),
+    ],
+)
+def test_fact_after_20_s_the_first_accuracy_decides_whether_a_copter_uses_the_position_again(
+    check: float, first: dict[str, float], used_again: bool
+) -> None:
+    """AP_NavEKF3_VehicleStatus.cpp, calcGpsGoodToAlign; on firmware 4.6.3 with check 31 and 6.6 m: not in 42 s."""
+    rig = flying(Kind.COPTER, parameters={"EK3_GPS_CHECK": check})
+    rig.fly(20.0)
+    rig.fly(0.2, changed(**first))
+    rig.fly(1.0, GOOD)
+    assert bool(rig.flags() & ABSOLUTE) is used_again
+    rig.fly(9.5, changed(hacc=4.9))
+    assert rig.flags() & ABSOLUTE, "ten seconds of good accuracies open the checks again"
+
+
+def test_fact_after_20_s_with_accuracies_of_5_1_m_a_closed_check_stays_closed() -> None:
+    rig = flying(Kind.COPTER, parameters={"EK3_GPS_CHECK": 31.0})
+    rig.fly(20.0)
+    rig.fly(0.2, changed(hacc=7.0))
+    rig.fly(40.0, changed(hacc=5.1))
+    assert not rig.flags() & ABSOLUTE
+
+
+def test_fact_a_gap_below_15_s_does_not_depend_on_the_first_accuracy() -> None:
+    rig = flying(Kind.COPTER, parameters={"EK3_GPS_CHECK": 31.0})
+    rig.fly(12.0)
+    rig.fly(1.0, changed(hacc=9.0))
+    assert rig.flags() & ABSOLUTE
+
+
 def test_fact_in_a_gap_of_12_s_a_plane_dead_reckons_and_then_resets() -> None:
     rig = flying(Kind.PLANE)
     assert rig.fly(12.0, until=lambda: not rig.flags() & ABSOLUTE) == pytest.approx(10.0, abs=0.3)

@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.link.output.gps_time import GPS_EPOCH_UNIX_S, gps_minus_utc_s
-from terrafix_tools.sim.autopilot.navigation.align import Alignment, prearm_failures
+from terrafix_tools.sim.autopilot.navigation.align import STOPPED_AFTER_S, Alignment, prearm_failures
 from terrafix_tools.sim.autopilot.navigation.ekf import Ekf, Fusion
 from terrafix_tools.sim.autopilot.navigation.gps import WEEK_S, Fix, GpsInputDriver, GpsInstance
 from terrafix_tools.sim.autopilot.navigation.receivers import Receivers
@@ -94,7 +94,7 @@ class SimAutopilot:
         self.counts = Counts()
         self.gps_input_fixes: list[Fix] = []  # 3D fixes from GPS_INPUT; the monitor empties the list
         self._wire = Wire(self.parameters, sysid, boot_ns)
-        self._alignment = Alignment(kind)
+        self._alignment = Alignment(kind, good=start is not None)
         self._source_set = 1
         self._home_amsl_m = home_amsl_m
         self._using_since_s: float | None = None
@@ -194,8 +194,16 @@ class SimAutopilot:
             self._alignment.restart()
             return
         self.status.update_speed_accuracy(fix, now_s)
+        check, scale = int(self.parameters["EK3_GPS_CHECK"]), self.parameters["EK3_CHECK_SCALE"]
+        had_origin = self._alignment.origin_s is not None
+        self._alignment.check(fix, now_s, check, scale)
+        if self.ekf is None and not had_origin and self._alignment.origin_s is not None:
+            self._wire.send_text(INFO, "EKF3 IMU0 origin set", now_s)
         if self.ekf is None and not self._align(fix, now_s):
             counts.waiting_for_alignment += 1
+        elif self._has_stopped(now_s) and not self._alignment.good:
+            counts.waiting_for_alignment += 1
+            return
         if self.ekf is None:
             return
         sources = self._sources()
@@ -208,17 +216,18 @@ class SimAutopilot:
                 counts.resets += 1
 
     def _align(self, fix: Fix, now_s: float) -> bool:
-        check, scale = int(self.parameters["EK3_GPS_CHECK"]), self.parameters["EK3_CHECK_SCALE"]
-        had_origin = self._alignment.origin_s is not None
-        ready = self._alignment.update(fix, now_s, check, scale)
-        if not had_origin and self._alignment.origin_s is not None:
-            self._wire.send_text(INFO, "EKF3 IMU0 origin set", now_s)
+        ready = self._alignment.ready(now_s)
         if ready and self._readings is not None:
             r, (vn, ve, vd) = self._readings, fix.velocity_ned_mps
             here = np.array([*self._frame.to_local(fix.lat_deg, fix.lon_deg), r.baro_amsl_m])
             there = Navigation(here, np.array([ve, vn, -vd]), r.yaw_rad, r.pitch_rad, r.roll_rad, r.airspeed_mps or 0.0)
             self.ekf = Ekf(self._frame, there, fixed_wing=self.kind is Kind.PLANE)
         return ready
+
+    def _has_stopped(self, now_s: float) -> bool:
+        """Whether the filter has stopped aiding. A plane's is aided by airspeed and zero sideslip."""
+        last_pass_s = None if self.ekf is None else self.ekf.last_pass_s
+        return self.kind is Kind.COPTER and last_pass_s is not None and now_s - last_pass_s > STOPPED_AFTER_S
 
     def _sources(self) -> Sources:
         wanted = (self.parameters[f"EK3_SRC{self._source_set}_{what}"] == SOURCE_GPS for what in ("POSXY", "VELXY"))
