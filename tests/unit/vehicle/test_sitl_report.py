@@ -1,5 +1,6 @@
 """The observer's log and the report from it, with constructed packets and trajectories."""
 
+import contextlib
 import json
 import math
 import socket
@@ -315,6 +316,34 @@ def test_the_truth_has_the_firmware_time_regardless_of_its_arrival() -> None:
         send(25 * i, 0.0)
     assert all(b.t_ns > a.t_ns for a, b in pairwise(log.truth))
     assert log.truth[-1].t_ns == 25 * 299 * 1_000_000 + apart_ns
+
+
+def test_after_a_reboot_of_the_firmware_the_truth_has_the_time_of_arrival_again() -> None:
+    log = FlightLog()
+
+    def send(boot_ms: int, arrival_ns: int) -> None:
+        record(log, mavlink.MAVLink_system_time_message(0, boot_ms), arrival_ns)
+        record(log, mavlink.MAVLink_sim_state_message(*[0.0] * 21, 0, 0), arrival_ns)
+
+    for i in range(100):
+        send(60_000 + 25 * i, 100 * S + i * 25_000_000)
+    send(4_000, 110 * S)
+    assert log.truth[-1].t_ns == 110 * S
+
+
+def test_streams_that_a_rebooted_firmware_no_longer_sends_are_requested_again() -> None:
+    observer = Observer(0)
+    with observer, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as firmware:
+        firmware.settimeout(0.2)
+        mav, requested, until_s = mavlink.MAVLink(None, 1, 1), [], time.monotonic() + 8.0
+        packets = [mavlink.MAVLink_system_time_message(0, 1), mavlink.MAVLink_gps_raw_int_message(0, 3, *[0] * 8)]
+        began_s = time.monotonic()
+        while time.monotonic() < until_s and mavlink.MAVLINK_MSG_ID_GPS_RAW_INT not in requested:
+            for packet in packets[: 2 if time.monotonic() - began_s < 1.0 else 1]:
+                firmware.sendto(packet.pack(mav), observer.address)
+            with contextlib.suppress(TimeoutError):
+                requested += [int(x.param1) for x in mav.parse_buffer(firmware.recv(4096)) or []]
+    assert mavlink.MAVLINK_MSG_ID_GPS_RAW_INT in requested
 
 
 def test_truth_is_interpolated_between_two_states() -> None:

@@ -25,6 +25,7 @@ RECEIVE_TIMEOUT_S = 0.1  # receive time-out, after which the stop request is che
 OFFSET_SAMPLES = 80  # number of clock offsets in the median: two seconds
 CYCLE_NS = 1_000_000  # messages of one firmware loop cycle arrive in a burst within this time
 REQUEST_INTERVAL_S = 2.0  # request interval: requests are UDP datagrams, which may arrive before the firmware listens
+SILENT_S = 3.0  # without a message of a requested stream: the firmware was restarted
 RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_SIM_STATE: 40,  # a plane's 50 Hz loop sends a stream at most at 80 % of that rate
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 40,  # same rate: it arrives right before SIM_STATE, which has no time stamp
@@ -86,7 +87,9 @@ class SimulatedTime:
         self._boot_ms, self._arrival_ns = 0, 0  # boot time and arrival of the last SYSTEM_TIME
 
     def update(self, boot_ms: int, arrival_ns: int) -> None:
-        """Adds the clock offset of a SYSTEM_TIME."""
+        """Adds the clock offset of a SYSTEM_TIME. After a reboot of the firmware the offset is another one."""
+        if boot_ms < self._boot_ms:
+            self._offsets_ns.clear()
         self._offsets_ns.append(arrival_ns - boot_ms * 1_000_000)
         self._boot_ms, self._arrival_ns = boot_ms, arrival_ns
 
@@ -134,9 +137,14 @@ class Observer:
             raise LinkError(f"cannot listen on UDP port {port} ({error.strerror}); choose another --port") from None
         self._socket.settimeout(RECEIVE_TIMEOUT_S)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        self._seen: set[int] = set()
+        self._seen_s: dict[int, float] = {}  # message id -> time of the last one
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="sitl-observer", daemon=True)
+
+    @property
+    def address(self) -> tuple[str, int]:
+        host, port = self._socket.getsockname()
+        return str(host), int(port)
 
     def truth_at(self, t_ns: int) -> Truth | None:
         """Interpolates the true state at ``t_ns``; None before the first and after the last state."""
@@ -165,11 +173,19 @@ class Observer:
             now_ns = arrival_ns(extra)
             for message in self._mav.parse_buffer(packet) or []:
                 record(self.log, message, now_ns)
-                self._seen.add(message.get_msgId())
-            missing = {*RATES_HZ, ONCE} - self._seen
-            if missing and time.monotonic() - requested_s > REQUEST_INTERVAL_S:
+                self._seen_s[message.get_msgId()] = time.monotonic()
+            if time.monotonic() - requested_s > REQUEST_INTERVAL_S and (missing := self._missing()):
                 requested_s = time.monotonic()
                 self._request_messages(missing, sender)
+
+    def _missing(self) -> set[int]:
+        """-> what has not arrived, or, since a reboot of the firmware, no longer arrives."""
+        since_s = time.monotonic() - SILENT_S
+        return {
+            kind
+            for kind in (*RATES_HZ, ONCE)
+            if kind not in self._seen_s or (kind != ONCE and self._seen_s[kind] < since_s)
+        }
 
     def _request_messages(self, kinds: set[int], whom: tuple[str, int]) -> None:
         for kind in sorted(kinds):

@@ -3,6 +3,7 @@
 The parameters that concern Terrafix are in config/vehicles/, so that the tested files are those that users load.
 """
 
+import math
 from pathlib import Path
 
 from terrafix.core.errors import OutputError, UsageError
@@ -14,7 +15,7 @@ CRUISE_M = 120.0  # above home
 APPROACH_M = 55.0  # height of the last waypoint before the landing, for a plane
 APPROACH_FROM_M = 480.0  # its distance from the landing point: a glide path of 6.5 degrees
 WORLD_M = (4000.0, 2000.0)  # east-west, north-south
-WEST_EAST_M = (500.0, 3500.0)  # the loop, in plan metres of the world: the camera covers
+WEST_EAST_M = (500.0, 3500.0)  # the longest loop, in plan metres of the world: the camera covers
 NORTH_SOUTH_M = (500.0, 1500.0)  # about 110 m to each side, and a plane turns wide
 HOME_EAST_M = 2000.0  # on the southern side, which leaves room for climb and glide path
 EXTRA_M = 2800.0  # distance that may be flown before the GNSS loss, plus what a plane cuts off at the corners
@@ -95,18 +96,23 @@ def place_of(world: World) -> tuple[float, float]:
 def laps_for(length_m: float) -> tuple[int, float]:
     """Returns the number of laps that ``length_m`` needs after the GNSS loss, and the length of one lap, m."""
     (west, east), (north, south) = WEST_EAST_M, NORTH_SOUTH_M
-    lap_m = 2 * (east - west) + 2 * (south - north)
-    return max(1, -int(-(length_m + EXTRA_M) // lap_m)), lap_m
+    longest_m = 2 * (east - west) + 2 * (south - north)
+    shortest_m = 8 * APPROACH_FROM_M + 2 * (south - north)  # a plane's glide path begins inside the loop
+    needed_m = max(length_m + EXTRA_M, shortest_m)
+    laps = math.ceil(needed_m / longest_m)
+    return laps, needed_m / laps
 
 
 def mission_for(world: World, kind: Kind, length_m: float) -> Mission:
     """Builds the mission: take-off, laps of the loop for ``length_m`` after the GNSS loss, landing at home. Raises
     UsageError.
     """
-    (west, east), (north, south) = WEST_EAST_M, NORTH_SOUTH_M
+    north, south = NORTH_SOUTH_M
     laps, lap_m = laps_for(length_m)
     if length_m <= 0.0 or laps > LAPS_MAX:
         raise UsageError(f"--length {length_m / 1e3:g}: choose more than 0 and at most {LAPS_MAX * lap_m / 1e3:.0f} km")
+    half_m = lap_m / 4 - (south - north) / 2
+    west, east = HOME_EAST_M - half_m, HOME_EAST_M + half_m
     corners = [(east, south), (east, north), (west, north), (west, south)]
     places = [(x, y, CRUISE_M) for _ in range(laps) for x, y in corners]
     if kind is Kind.PLANE:
