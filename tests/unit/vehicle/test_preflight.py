@@ -20,6 +20,7 @@ from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.signature import generate
+from terrafix.link.gnss.previous_source import PreviousSource, PreviousSourceFile
 from terrafix.link.mavlink.transport import Address, Chunk
 from terrafix.map.package import MapPackage
 from terrafix_tools.cli import app
@@ -31,8 +32,8 @@ from terrafix_tools.preflight import computer, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
 from terrafix_tools.preflight.lines import Line, Status, number
 from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
-from terrafix_tools.preflight.rules import Context
-from terrafix_tools.preflight.run import _vehicle_lines, preflight
+from terrafix_tools.preflight.rules import ALWAYS, GPS_INPUT_RULES, LOCAL_RULES, Context
+from terrafix_tools.preflight.run import _parameter_lines, _vehicle_lines, preflight
 from terrafix_tools.sim.autopilot.parameters import FIRMWARE
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -42,11 +43,16 @@ PAGE = ROOT / "docs" / "autopilot.md"
 DEFAULTS = FIRMWARE | {
     "AHRS_EKF_TYPE": 3,
     "EK3_ENABLE": 1,
+    "EK3_GLITCH_RAD": 25,
+    "EK3_POSNE_M_NSE": 0.5,
     "EK3_POS_I_GATE": 500,
+    "EK3_SRC_OPTIONS": 1,
     "EK3_SRC1_YAW": 1,
     "EK3_VELNE_M_NSE": 0.5,
     "EK3_VEL_I_GATE": 500,
+    "FS_EKF_ACTION": 1,
     "FS_EKF_THRESH": 0.8,
+    **{f"GPS{n}_POS_{axis}": 0 for n in (1, 2) for axis in "XYZ"},
     "GPS_HDOP_GOOD": 140,
     "SERIAL1_PROTOCOL": 2,
     "SERIAL1_BAUD": 57,
@@ -91,9 +97,9 @@ def test_the_presets_pass_all_rules(name: str) -> None:
     assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
 
 
-def test_the_preset_with_a_real_receiver_passes_all_rules() -> None:
-    values = DEFAULTS | preset("second-gps") | {"EK3_GPS_CHECK": 23}
-    lines = lines_by_check(values, context(gps_id=1))
+@pytest.mark.parametrize("plane", [False, True])
+def test_the_preset_with_a_real_receiver_passes_all_rules(plane: bool) -> None:
+    lines = lines_by_check(DEFAULTS | preset("second-gps"), context(plane=plane, gps_id=1))
     assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
 
 
@@ -103,6 +109,22 @@ def test_the_proposed_changes_on_a_new_autopilot_are_the_preset(plane: bool, nam
     assert changes.items() <= preset(name).items()
     after = DEFAULTS | changes
     assert all(line.status is Status.OK for line in check_parameters(after, context(plane=plane)))
+
+
+@pytest.mark.parametrize(("name", "gps_id"), [("plane", 0), ("copter", 0), ("second-gps", 1)])
+def test_each_value_of_a_preset_is_what_its_rule_proposes(name: str, gps_id: int) -> None:
+    at = context(plane=name != "copter", gps_id=gps_id)
+    rules = {r.name.format(n=at.gps, m=at.other): r for r in (*GPS_INPUT_RULES, *ALWAYS) if r.applies(at, DEFAULTS)}
+    untouched = {"AHRS_OPTIONS": 0.0, "EK3_GPS_CHECK": 31.0}  # of bits the default value decides
+    for parameter, value in preset(name).items():
+        assert rules[parameter].valid(value)
+        assert rules[parameter].fix(untouched.get(parameter, -1.0), at) == value
+
+
+def test_the_page_names_every_parameter_that_preflight_checks() -> None:
+    named = set(re.findall(r"`([A-Z0-9_n]+)`", PAGE.read_text()))
+    checked = {rule.name.format(n="n", m="n") for rule in (*GPS_INPUT_RULES, *LOCAL_RULES, *ALWAYS)}
+    assert {n for n in checked if n not in named and n.replace("GPSn", "GPS1") not in named} == set()
 
 
 @pytest.mark.parametrize("name", ["plane", "copter", "second-gps"])
@@ -158,7 +180,7 @@ def test_the_firmware_version_comes_from_autopilot_version(monkeypatch: pytest.M
     for version in (4 << 24 | 6 << 16, 4 << 24 | 7 << 16):
         with Autopilot(LinkSection(), GroundAutopilot(TWO_PORTS, version=version)) as autopilot:
             autopilot.connect()
-            list(_vehicle_lines(autopilot, Config()))
+            _parameter_lines(autopilot, _vehicle_lines(autopilot, Config())[0])
     assert firmwares == [(4, 6), (4, 7)]
 
 
@@ -177,6 +199,11 @@ def test_the_firmware_version_comes_from_autopilot_version(monkeypatch: pytest.M
         ("AHRS_OPTIONS", 2, "warn", "set 3"),
         ("ARSPD_USE", 0, "warn", "170 m"),
         ("EK3_CHECK_SCALE", 50, "warn", "set 100"),
+        ("EK3_SRC1_VELZ", 0, "warn", "set 3"),
+        ("EK3_POSNE_M_NSE", 5.0, "warn", "set 0.5"),
+        ("EK3_GLITCH_RAD", 0, "warn", "clipped"),
+        ("GPS1_POS_X", 0.4, "warn", "antenna"),
+        ("GPS2_TYPE", 14, "fail", "both GPS"),
     ],
 )
 def test_each_wrong_value_has_a_reason_and_a_fix(name: str, value: float, status: str, says: str) -> None:
@@ -199,12 +226,40 @@ def test_a_blending_switch_with_a_real_receiver_is_a_warning() -> None:
     assert "GPS_AUTO_SWITCH" not in lines_by_check(DEFAULTS, context())  # not relevant without another receiver
 
 
+def test_only_a_copter_has_a_failsafe_action() -> None:
+    values = DEFAULTS | preset("copter") | {"FS_EKF_ACTION": 0}
+    assert "drifts on" in lines_by_check(values, context(plane=False))["FS_EKF_ACTION"].text
+    assert "FS_EKF_ACTION" not in lines_by_check(values, context(plane=True))
+
+
+def test_fusing_all_velocities_is_a_warning_where_another_source_set_has_one() -> None:
+    assert "EK3_SRC_OPTIONS" not in lines_by_check(DEFAULTS | preset("plane"), context())
+    values = DEFAULTS | preset("plane") | {"EK3_SRC2_VELXY": 6}
+    assert lines_by_check(values, context())["EK3_SRC_OPTIONS"].fix == "set 0"
+
+
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [({"GPS_AUTO_SWITCH": 0}, "GPS_AUTO_SWITCH"), ({"GPS_PRIMARY": 1}, "GPS_PRIMARY")],
+)
+def test_what_a_flight_on_terrafix_leaves_is_a_warning(values: dict[str, float], name: str) -> None:
+    line = lines_by_check(DEFAULTS | preset("second-gps") | values, context(gps_id=1))[name]
+    assert line.status == "warn"
+    assert line.change is not None and line.change.new == preset("second-gps")[name]
+
+
 def test_local_frame_outputs_have_their_own_rules() -> None:
     at = context(outputs=["odometry"])
     lines = lines_by_check(DEFAULTS, at)
     assert "GPS1_TYPE" not in lines
     assert (lines["VISO_TYPE"].status, lines["source set"].status) == ("fail", "fail")
-    good = DEFAULTS | {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "EK3_SRC2_VELXY": 6, "AHRS_OPTIONS": 1}
+    good = DEFAULTS | {
+        "EK3_SRC_OPTIONS": 0,
+        "VISO_TYPE": 1,
+        "EK3_SRC2_POSXY": 6,
+        "EK3_SRC2_VELXY": 6,
+        "AHRS_OPTIONS": 1,
+    }
     assert all(line.status is Status.OK for line in check_parameters(good, at))
     loop = lines_by_check(good | {"EK3_SRC2_YAW": 6}, at)["source set"]
     assert "the autopilot's own" in loop.text
@@ -351,6 +406,65 @@ def test_write_sets_wrong_parameters_and_saves_the_previous_values(wired: Any, t
     saved = dict(line.split(",") for line in Path(output["saved_to"]).read_text().splitlines())
     assert {name: float(value) for name, value in saved.items()} == {name: DEFAULTS[name] for name in saved}
     assert set(saved) == {change["name"] for change in output["written"]} == set(there.parameters_set)
+
+
+def test_after_writing_the_result_is_that_of_the_values_read_back(wired: Any, tmp_path: Path) -> None:
+    there = GroundAutopilot(DEFAULTS)
+    wired(there)
+    done = CliRunner().invoke(app, ["preflight", "--write", "--yes", "--autopilot-only", "--out", str(tmp_path)])
+    assert done.exit_code == 0
+    assert "Read back from the autopilot:" in done.output
+    assert "0 failures" in done.output.splitlines()[-1]
+
+
+LEFT = {"GPS_AUTO_SWITCH": 4, "GPS_PRIMARY": 1}  # by a flight that ended on Terrafix
+
+
+@pytest.fixture
+def second(tmp_path: Path) -> list[str]:
+    config = tmp_path / "second.toml"
+    config.write_text("[link]\ngps_id = 1\n")
+    return ["preflight", "--autopilot-only", "--config", str(config), "--out", str(tmp_path / "out")]
+
+
+@pytest.fixture
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    return tmp_path / "state"
+
+
+def test_restore_sets_back_what_a_flight_has_changed_and_nothing_else(
+    wired: Any, second: list[str], state: Path
+) -> None:
+    PreviousSourceFile(state).save(PreviousSource(1, {"GPS_AUTO_SWITCH": 2.0, "GPS_PRIMARY": 0.0}))
+    there = GroundAutopilot(DEFAULTS | preset("second-gps") | LEFT | {"GPS2_DELAY_MS": 0})
+    wired(there)
+    seen = CliRunner().invoke(app, second)
+    assert seen.exit_code == 1
+    assert "GPS_PRIMARY is 1 since a flight that ended on Terrafix; it was 0" in seen.output
+    assert "terrafix preflight --restore" in seen.output
+    CliRunner().invoke(app, [*second, "--restore", "--yes"])
+    assert {name: there.values[name] for name in LEFT} == {"GPS_AUTO_SWITCH": 2.0, "GPS_PRIMARY": 0.0}
+    assert set(there.parameters_set) == set(LEFT)
+    assert PreviousSourceFile(state).load() is None
+
+
+def test_restore_without_a_file_sets_what_the_rules_want(wired: Any, second: list[str], state: Path) -> None:
+    there = GroundAutopilot(DEFAULTS | preset("second-gps") | LEFT)
+    wired(there)
+    done = CliRunner().invoke(app, [*second, "--restore", "--yes"])
+    assert done.exit_code == 0
+    assert there.values["GPS_PRIMARY"] == 0
+    assert there.parameters_set == ["GPS_PRIMARY"]
+
+
+def test_restore_leaves_the_state_of_another_vehicle(wired: Any, second: list[str], state: Path) -> None:
+    PreviousSourceFile(state).save(PreviousSource(9, {"GPS_PRIMARY": 0.0}))
+    there = GroundAutopilot(DEFAULTS | preset("second-gps") | LEFT)
+    wired(there)
+    done = CliRunner().invoke(app, [*second, "--restore", "--yes"])
+    assert "since a flight" not in done.output
+    assert PreviousSourceFile(state).load() is not None
 
 
 def test_without_confirmation_nothing_is_set(wired: Any, tmp_path: Path) -> None:

@@ -16,6 +16,9 @@ def preflight(
         "out"
     ),
     write: Annotated[bool, typer.Option("--write", help="Set wrong parameters, after confirmation.")] = False,
+    restore: Annotated[
+        bool, typer.Option("--restore", help="Set the source of position back that a flight has changed.")
+    ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Skip the confirmation.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
     autopilot_only: Annotated[bool, typer.Option("--autopilot-only", help="Skip map, camera and computer.")] = False,
@@ -33,6 +36,7 @@ def preflight(
         mission=mission,
         out=out,
         write=write,
+        restore=restore,
         yes=yes,
         as_json=as_json,
         with_computer=not autopilot_only,

@@ -41,7 +41,12 @@ def check_parameters(values: Values, context: Context) -> Iterator[Line]:
 
 
 def proposed_changes(lines: Iterable[Line]) -> list[Change]:
-    return [line.change for line in lines if line.change is not None]
+    """-> one change for each parameter: the first that is proposed."""
+    changes: dict[str, Change] = {}
+    for line in lines:
+        if line.change is not None:
+            changes.setdefault(line.change.name, line.change)
+    return list(changes.values())
 
 
 def _name(rule: Rule, context: Context) -> str:

@@ -1,7 +1,7 @@
 """Required values of the autopilot's parameters, with reasons. The facts: docs/autopilot.md."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from terrafix.core.config import LinkSection
 from terrafix.link.output.selection import PositionOutputs
@@ -10,6 +10,7 @@ from terrafix_tools.preflight.lines import Status
 MAV_GPS = 14
 GPS, BARO, COMPASS, EXTERNAL_NAV = 3, 1, 1, 6  # EK3_SRCn_*
 POSITION_ACCURACY, GPS_ARMING, NO_DCM = 8, 8, 1  # bits of EK3_GPS_CHECK, ARMING_CHECK and _SKIPCHK, AHRS_OPTIONS
+FUSE_ALL_VELOCITIES = 1  # bit of EK3_SRC_OPTIONS
 ALL_BUT_GPS = 1048566  # ARMING_CHECK
 SKIPS_CHECKS = (4, 7)  # from this firmware on ARMING_SKIPCHK has the checks to skip, instead of those to run
 DELAY_MS = (1.0, 50.0)
@@ -56,6 +57,9 @@ class Rule:
     applies: Callable[[Context, Values], bool] = lambda _c, _v: True
 
 
+ARMS_ON_ALL = "arming requires a 3D fix of every GPS, and Terrafix has none, or a coarse one, on the ground"
+
+
 def _one_of(*allowed: float) -> Callable[[float], bool]:
     return lambda value: value in allowed
 
@@ -77,8 +81,49 @@ def _has_receiver(context: Context, values: Values) -> bool:
     return values.get(f"GPS{context.other}_TYPE", 0.0) > 0
 
 
+def _fuses_other_velocities(_context: Context, values: Values) -> bool:
+    """Another source set has a velocity that is not that of GPS."""
+    return any(values.get(f"EK3_SRC{k}_VELXY", 0.0) not in (0.0, GPS) for k in (2, 3))
+
+
+def _antenna(axis: str) -> "Rule":
+    return Rule(
+        f"GPS{{n}}_POS_{axis}",
+        _one_of(0),
+        _constant(0),
+        Status.WARN,
+        "the position that is sent is that of the vehicle, and the EKF subtracts this offset of an antenna",
+    )
+
+
+def _primary(receiver: int) -> "Rule":
+    return Rule(
+        "GPS_PRIMARY",
+        _one_of(receiver),
+        _constant(receiver),
+        Status.WARN,
+        f"the receiver, {receiver}, is the primary one; Terrafix is, after a flight that ended on its position",
+        lambda c, v: _has_receiver(c, v) and c.other - 1 == receiver,
+    )
+
+
+SOURCE_OPTIONS = Rule(
+    "EK3_SRC_OPTIONS",
+    lambda v: not int(v) & FUSE_ALL_VELOCITIES,
+    lambda v, _c: float(int(v) & ~FUSE_ALL_VELOCITIES),
+    Status.WARN,
+    "with bit 0 the velocities of all source sets are fused, that of a spoofed receiver, too",
+)
 GPS_INPUT_RULES = (
     Rule("GPS{n}_TYPE", _one_of(MAV_GPS), _constant(MAV_GPS), Status.FAIL, "only type 14 accepts GPS_INPUT"),
+    Rule(
+        "GPS{m}_TYPE",
+        lambda v: v != MAV_GPS,
+        lambda _v, _c: None,
+        Status.FAIL,
+        "both GPS are of type 14, and Terrafix sends for one of them; set the type of the receiver, or 0",
+        lambda c, v: f"GPS{c.other}_TYPE" in v,
+    ),
     Rule(
         "GPS{n}_DELAY_MS",
         lambda v: DELAY_MS[0] <= v <= DELAY_MS[1],
@@ -88,20 +133,14 @@ GPS_INPUT_RULES = (
     ),
     Rule(
         "GPS_AUTO_SWITCH",
-        _one_of(0, 4),
+        _one_of(4),
         _constant(4),
         Status.WARN,
-        "4 flies on the receiver while it has a 3D fix, and on Terrafix when not; 1 and 2 choose by number or blend",
+        "4 flies on the receiver while it has a 3D fix, on Terrafix when not; 0 stays with GPS_PRIMARY without a fix, "
+        "too, 1 and 2 choose by number or blend",
         _has_receiver,
     ),
-    Rule(
-        "GPS_PRIMARY",
-        _one_of(0, 1),
-        lambda _v, c: float(c.other - 1),
-        Status.WARN,
-        "the real receiver is the primary one on the ground",
-        _has_receiver,
-    ),
+    *(_primary(receiver) for receiver in (0, 1)),
     Rule("EK3_SRC1_POSXY", _one_of(GPS), _constant(GPS), Status.FAIL, "position comes as GPS"),
     Rule(
         "EK3_SRC1_VELXY",
@@ -110,7 +149,9 @@ GPS_INPUT_RULES = (
         Status.FAIL,
         "velocity is sent; without it the filter follows a wrong position within seconds",
     ),
-    Rule("EK3_SRC1_VELZ", _one_of(0, GPS), _constant(GPS), Status.WARN, "vertical velocity is sent"),
+    Rule("EK3_SRC1_VELZ", _one_of(GPS), _constant(GPS), Status.WARN, "vertical velocity is sent"),
+    replace(SOURCE_OPTIONS, applies=_fuses_other_velocities),
+    *(_antenna(axis) for axis in "XYZ"),
     Rule(
         "EK3_GPS_CHECK",
         lambda v: not int(v) & POSITION_ACCURACY,
@@ -137,6 +178,20 @@ GPS_INPUT_RULES = (
         "EK3_POS_I_GATE", lambda v: 300 <= v <= 1000, _constant(500), Status.WARN, "hundredths of sigma of our accuracy"
     ),
     Rule(
+        "EK3_POSNE_M_NSE",
+        lambda v: 0.1 <= v <= 1.0,
+        _constant(0.5),
+        Status.WARN,
+        "the least accuracy, m, that the EKF takes from us: a larger one makes a good position count less",
+    ),
+    Rule(
+        "EK3_GLITCH_RAD",
+        lambda v: 10 <= v <= 100,
+        _constant(25),
+        Status.WARN,
+        "with 0 a position beyond the gate is clipped instead of rejected, and pulls the EKF; m of its own uncertainty",
+    ),
+    Rule(
         "GPS_HDOP_GOOD",
         lambda v: v >= 110,
         _constant(140),
@@ -149,7 +204,7 @@ GPS_INPUT_RULES = (
         lambda v: v != 1 and not int(v) & GPS_ARMING,
         _constant(ALL_BUT_GPS),
         Status.WARN,
-        "arming requires a 3D fix of every GPS, and Terrafix has none on the ground",
+        ARMS_ON_ALL,
         lambda c, v: _has_receiver(c, v) and c.firmware < SKIPS_CHECKS,
     ),
     Rule(
@@ -157,7 +212,7 @@ GPS_INPUT_RULES = (
         lambda v: bool(int(v) & GPS_ARMING),
         lambda v, _c: float(int(v) | GPS_ARMING),
         Status.WARN,
-        "arming requires a 3D fix of every GPS, and Terrafix has none on the ground",
+        ARMS_ON_ALL,
         lambda c, v: _has_receiver(c, v) and c.firmware >= SKIPS_CHECKS,
     ),
 )
@@ -170,6 +225,7 @@ LOCAL_RULES = (
         Status.WARN,
         "positions are for the moment of sending",
     ),
+    SOURCE_OPTIONS,
 )
 ALWAYS = (
     Rule("EK3_ENABLE", _one_of(1), _constant(1), Status.FAIL, "the rules apply to EKF3"),
@@ -204,6 +260,14 @@ ALWAYS = (
         _constant(0.8),
         Status.WARN,
         "0 switches the failsafe for a lost position off",
+        _copter,
+    ),
+    Rule(
+        "FS_EKF_ACTION",
+        lambda v: v > 0,
+        _constant(1),
+        Status.WARN,
+        "0 only reports a lost position, and the copter drifts on in its mode",
         _copter,
     ),
 )

@@ -2,6 +2,7 @@
 
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import typer
 
 from terrafix.core.config import Config, load
 from terrafix.core.errors import LinkError, OutputError, UsageError
-from terrafix_tools.preflight import computer, ground, vehicle
+from terrafix_tools.preflight import computer, ground, position_source, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
 from terrafix_tools.preflight.lines import Change, Line, Status, fail, number
 from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
+from terrafix_tools.preflight.position_source import changes_to_restore
 from terrafix_tools.preflight.rules import Context
 
 MARKS = {Status.OK: "ok  ", Status.WARN: "warn", Status.FAIL: "FAIL"}
@@ -36,21 +38,23 @@ def preflight(
     mission: Path | None = None,
     out: Path = Path("out"),
     write: bool = False,
+    restore: bool = False,
     yes: bool = False,
     as_json: bool = False,
     with_computer: bool = True,
 ) -> bool:
-    """Runs and prints all checks; returns True when none failed. Raises ConfigError, OutputError, UsageError;
-    LinkError while writing.
+    """Runs and prints all checks; returns True when none failed. ``write``: sets wrong parameters; ``restore``: only
+    the source of position that a flight has changed. Raises ConfigError, OutputError, UsageError; LinkError while
+    writing.
     """
-    if write and as_json and not yes:
-        raise UsageError("--write needs a confirmation, which --json cannot request; add --yes")
+    if (write or restore) and as_json and not yes:
+        raise UsageError("setting parameters needs a confirmation, which --json cannot request; add --yes")
     config = _with_options(load(configs), link, map_path)
-    checks = _Checks(mission=mission)
+    checks = _Checks(mission=mission, choose=changes_to_restore if restore else proposed_changes)
     with tempfile.TemporaryDirectory() as folder:
         try:
             _check_autopilot(
-                checks, config, Path(folder), quiet=as_json, write_to=out if write else None, confirmed=yes
+                checks, config, Path(folder), quiet=as_json, write_to=out if write or restore else None, confirmed=yes
             )
         except LinkError as error:
             if checks.written or checks.saved_to:
@@ -73,21 +77,17 @@ def preflight(
 
 @dataclass
 class _Checks:
-    """State of a run. ``mission``: mission file to check; None: none is known."""
+    """State of a run. ``mission``: mission file to check; None: none is known. ``choose``: which changes to make."""
 
     mission: Path | None
+    choose: Callable[[list[Line]], list[Change]]
     lines: list[Line] = field(default_factory=list)
     written: list[Change] = field(default_factory=list)
     saved_to: str = ""
 
     def result(self) -> Preflight:
-        """``ready`` disregards failures that a written change has fixed."""
         return Preflight(
-            ready=all(
-                line.status is not Status.FAIL
-                for line in self.lines
-                if line.change not in self.written or line.change is None
-            ),
+            ready=all(line.status is not Status.FAIL for line in self.lines),
             lines=self.lines,
             written=self.written,
             saved_to=self.saved_to,
@@ -104,8 +104,9 @@ def _check_autopilot(
         autopilot.connect()
         if write_to is not None and autopilot.armed:
             raise UsageError("the autopilot is armed; disarm it before parameters are set")
-        vehicle_lines = list(_vehicle_lines(autopilot, config))
-        checks.lines += vehicle_lines
+        context, checks.lines = _vehicle_lines(autopilot, config)
+        parameters = _parameter_lines(autopilot, context)
+        checks.lines += parameters
         if checks.mission is None:
             on_board = folder / "mission on board"
             none = vehicle.save_mission(autopilot, on_board)
@@ -113,12 +114,20 @@ def _check_autopilot(
             checks.mission = on_board if none is None else None
         if not quiet:
             show(checks.lines)
-        changes = proposed_changes(vehicle_lines)
-        if write_to is not None and changes and (confirmed or _confirmed(changes)):
-            checks.saved_to = str(_save(changes, write_to))
-            for change in changes:
-                autopilot.write(change.name, change.new)
-                checks.written.append(change)
+        changes = checks.choose(parameters)
+        if write_to is None or not changes or not (confirmed or _confirmed(changes)):
+            return
+        checks.saved_to = str(_save(changes, write_to))
+        for change in changes:
+            autopilot.write(change.name, change.new)
+            checks.written.append(change)
+        again = _parameter_lines(autopilot, context)
+        if not any(line.check == position_source.CHECK for line in again):
+            position_source.forget(autopilot.sysid)
+        checks.lines = [line for line in checks.lines if line not in parameters] + again
+        if not quiet:
+            typer.echo("\nRead back from the autopilot:")
+            show(again)
 
 
 def show(lines: list[Line]) -> None:
@@ -136,13 +145,17 @@ def _with_options(config: Config, link: str, map_path: Path | None) -> Config:
     return config
 
 
-def _vehicle_lines(autopilot: Autopilot, config: Config) -> list[Line]:
+def _vehicle_lines(autopilot: Autopilot, config: Config) -> tuple[Context, list[Line]]:
     round_trip_ms = autopilot.round_trip_ms()
     lines = list(vehicle.check_lines(autopilot, config.link, round_trip_ms))
     delay_ms = vehicle.delay_advice_ms(config.link, round_trip_ms)
     firmware = vehicle.firmware_version(autopilot.newest.get(("AUTOPILOT_VERSION", autopilot.sysid)))
-    context = Context(config.link, autopilot.plane, autopilot.sysid, delay_ms, firmware)
-    return lines + list(check_parameters(autopilot.read(parameter_names(context)), context))
+    return Context(config.link, autopilot.plane, autopilot.sysid, delay_ms, firmware), lines
+
+
+def _parameter_lines(autopilot: Autopilot, context: Context) -> list[Line]:
+    values = autopilot.read(parameter_names(context))
+    return [*position_source.check_lines(autopilot.sysid, values), *check_parameters(values, context)]
 
 
 def _confirmed(changes: list[Change]) -> bool:
@@ -167,7 +180,7 @@ def _print_summary(result: Preflight) -> None:
     count = {status: sum(line.status is status for line in result.lines) for status in Status}
     if result.written:
         typer.echo(f"\n{len(result.written)} parameters set; their previous values are in {result.saved_to}")
-        typer.echo("Restart the autopilot and run preflight again.")
+        typer.echo("Restart the autopilot: some take effect only then.")
     typer.echo(
         f"\n{count[Status.OK]} ok, {_plural(count[Status.WARN], 'warning')}, {_plural(count[Status.FAIL], 'failure')}"
     )
