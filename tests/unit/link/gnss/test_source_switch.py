@@ -4,55 +4,28 @@ import json
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from autopilot_rig import FRAME, HEIGHT_M, Rig, at_5_hz, real_fix
-from link_rig import LAT, LON, S, estimate
+from companion_rig import Companion
+from link_rig import S
 from link_wire import MemoryWire, heartbeat, packed
 from terrafix import messages as m
-from terrafix.core.config import Config, GnssMode, LinkSection
-from terrafix.core.frames import MemoryFrameStore
-from terrafix.core.node import NodeContext
+from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.gnss.previous_source import FILE_NAME, PreviousSource, PreviousSourceFile
 from terrafix.link.gnss.source_switch import SourceSwitch
-from terrafix.link.mavlink.transport import Address
-from terrafix.link.node import make_node
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
 
 BEFORE = {"GPS_AUTO_SWITCH": 4.0, "GPS_PRIMARY": 0.0}
 SPOOFED_S = 15.0
-STEP_S = 0.02
+ACT = LinkSection(gps_id=1, gnss="act")
 
 
-class RigWire(MemoryWire):
-    """Connects the real edge with the simulated autopilot; the rig reads the autopilot's packets too."""
-
-    def __init__(self, rig: Rig) -> None:
-        super().__init__()
-        self._rig, transmit = rig, rig.autopilot.transmit
-
-        def tapped() -> bytes:
-            packets = transmit()
-            self.arrive(packets)
-            return packets
-
-        rig.autopilot.transmit = tapped  # type: ignore[method-assign]
-
-    def write(self, packet: bytes, to: Address | None = None) -> bool:
-        self._rig.autopilot.receive(packet, self._rig.t_s)
-        return True
-
-    def read(self) -> list[Any]:
-        self._rig.autopilot.transmit()
-        return super().read()
-
-
-class Companion:
-    """Edge and node of the link at a copter that hovers on a receiver (GPS1); the receiver is ``spoofed_m`` off between
-    ``spoofed_s`` and ``honest_s``. GPS_INPUT is GPS2."""
+class SpoofedFlight(Companion):
+    """A copter that hovers on a receiver (GPS1), which is ``spoofed_m`` off between SPOOFED_S and ``honest_s``.
+    GPS_INPUT is GPS2."""
 
     def __init__(self, folder: Path, parameters: dict[str, float] | None = None, spoofed_m: float = 20.0) -> None:
         self.honest_s = float("inf")
@@ -62,29 +35,7 @@ class Companion:
             return real_fix(*spoofed) if SPOOFED_S < t_s < self.honest_s else real_fix()
 
         values = BESIDE_A_RECEIVER | {"GPS1_TYPE": 1.0, "GPS1_DELAY_MS": 5.0} | (parameters or {})
-        self.rig = Rig(Kind.COPTER, parameters=values, real_gps=at_5_hz(receiver))
-        self.folder = folder
-        self.published: list[m.Message] = []
-        self.start()
-
-    def start(self, mode: GnssMode = "act") -> None:
-        config = LinkSection(gps_id=1, gnss=mode)
-        self.edge = MavlinkEdge(config, RigWire(self.rig), lambda: 0, previous_source=PreviousSourceFile(self.folder))
-        context = NodeContext(Config(link=config), MemoryFrameStore(), None, self.folder, state_dir=self.folder)
-        self.node = make_node(context)
-
-    def fly(self, until_s: float, *, images: bool = True) -> None:
-        while self.rig.t_s < until_s:
-            self.rig.fly(STEP_S)
-            now_ns = round(self.rig.t_s * S)
-            messages = list(self.edge.poll(now_ns))
-            if images and round(self.rig.t_s / STEP_S) % 25 == 0:
-                still = estimate(now_ns, velocity_enu_mps=(0.0, 0.0, 0.0), sigma_m=1.5)
-                messages.append(msgspec.structs.replace(still, lat_deg=LAT, lon_deg=LON))
-            answers = [answer for message in messages for answer in self.node.on(message)]
-            for answer in [*answers, *self.node.tick(now_ns)]:
-                self.published.append(answer)
-                self.edge.on_message(answer)
+        super().__init__(Rig(Kind.COPTER, parameters=values, real_gps=at_5_hz(receiver)), ACT, folder)
 
     def disarm(self) -> None:
         """The vehicle stands on the ground at its present height."""
@@ -100,8 +51,12 @@ class Companion:
         return [(x.vision, x.fallback) for x in self.published if isinstance(x, m.PositionSource)]
 
 
+def no_images(_t_s: float) -> None:
+    return None
+
+
 def test_an_autopilot_with_a_spoofed_receiver_is_switched_to_gps_input(tmp_path: Path) -> None:
-    flight = Companion(tmp_path)
+    flight = SpoofedFlight(tmp_path)
     flight.fly(22.0)
     assert flight.rig.autopilot.used_gps == 1
     assert flight.parameters == {"GPS_AUTO_SWITCH": 4.0, "GPS_PRIMARY": 1.0}
@@ -112,7 +67,7 @@ def test_an_autopilot_with_a_spoofed_receiver_is_switched_to_gps_input(tmp_path:
 
 def test_after_the_spoofing_the_autopilot_has_the_parameters_that_it_had_before(tmp_path: Path) -> None:
     blend = {"GPS_AUTO_SWITCH": 2.0, "GPS_PRIMARY": 0.0}
-    flight = Companion(tmp_path, blend)
+    flight = SpoofedFlight(tmp_path, blend)
     flight.fly(25.0)
     assert flight.parameters["GPS_PRIMARY"] == 1.0
     flight.honest_s = 25.0
@@ -139,7 +94,7 @@ def test_the_parameters_are_on_the_disk_before_they_are_changed(tmp_path: Path) 
 
 
 def test_a_killed_terrafix_leaves_the_receiver_to_the_autopilot(tmp_path: Path) -> None:
-    flight = Companion(tmp_path)
+    flight = SpoofedFlight(tmp_path)
     flight.fly(20.0)
     assert flight.rig.autopilot.used_gps == 1
     flight.rig.fly(6.0)  # nothing is sent any more
@@ -147,10 +102,10 @@ def test_a_killed_terrafix_leaves_the_receiver_to_the_autopilot(tmp_path: Path) 
 
 
 def test_a_restarted_link_restores_the_receiver_when_it_is_trusted_again(tmp_path: Path) -> None:
-    flight = Companion(tmp_path)
+    flight = SpoofedFlight(tmp_path)
     flight.fly(20.0)
     flight.honest_s = 20.0
-    flight.start()  # the earlier process was killed, and closed nothing
+    flight.start(ACT)  # the earlier process was killed, and closed nothing
     flight.fly(22.0)
     assert flight.parameters["GPS_PRIMARY"] == 1.0, "what it has restored is not yet known to be right"
     flight.fly(60.0)
@@ -160,10 +115,10 @@ def test_a_restarted_link_restores_the_receiver_when_it_is_trusted_again(tmp_pat
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_vehicle_that_lands_during_the_spoofing_gets_its_parameters_back(tmp_path: Path, restarted: bool) -> None:
-    flight = Companion(tmp_path)
+    flight = SpoofedFlight(tmp_path)
     flight.fly(20.0)
     if restarted:
-        flight.start()
+        flight.start(ACT)
     flight.disarm()
     flight.fly(25.0)
     assert flight.parameters == BEFORE
@@ -171,7 +126,7 @@ def test_a_vehicle_that_lands_during_the_spoofing_gets_its_parameters_back(tmp_p
 
 
 def test_an_ordered_stop_restores_the_parameters(tmp_path: Path) -> None:
-    flight = Companion(tmp_path)
+    flight = SpoofedFlight(tmp_path)
     flight.fly(20.0)
     flight.edge.close()
     assert flight.parameters == BEFORE
@@ -179,35 +134,35 @@ def test_an_ordered_stop_restores_the_parameters(tmp_path: Path) -> None:
 
 
 def test_after_a_loss_of_power_the_next_start_restores_the_parameters(tmp_path: Path) -> None:
-    flight = Companion(tmp_path)
+    flight = SpoofedFlight(tmp_path)
     flight.fly(20.0)
     left = flight.parameters
-    next_day = Companion(tmp_path, left, spoofed_m=0.0)  # the autopilot saves its parameters
+    next_day = SpoofedFlight(tmp_path, left, spoofed_m=0.0)  # the autopilot saves its parameters
     next_day.disarm()
     next_day.rig.fly(5.0)
     assert next_day.rig.autopilot.used_gps == 0, "the receiver is used without Terrafix, too"
-    next_day.fly(10.0, images=False)
+    next_day.fly(10.0, no_images)
     assert next_day.parameters == BEFORE
     assert not (tmp_path / FILE_NAME).exists()
 
 
 def test_a_link_that_no_longer_switches_restores_what_an_earlier_one_has_switched(tmp_path: Path) -> None:
-    flight = Companion(tmp_path)
+    flight = SpoofedFlight(tmp_path)
     flight.fly(20.0)
-    flight.start("off")
+    flight.start(LinkSection(gps_id=1, gnss="off"))
     flight.fly(22.0)
     assert flight.parameters == BEFORE
 
 
 def test_without_a_fix_of_ours_the_autopilot_is_kept_off_a_spoofed_receiver_for_35_seconds(tmp_path: Path) -> None:
-    flight = Companion(tmp_path, spoofed_m=300.0)
+    flight = SpoofedFlight(tmp_path, spoofed_m=300.0)
     flight.fly(20.0)
-    flight.fly(30.0, images=False)
+    flight.fly(30.0, no_images)
     assert flight.parameters == {"GPS_AUTO_SWITCH": 0.0, "GPS_PRIMARY": 1.0}
     assert flight.rig.autopilot.used_gps == 1
     flight.fly(36.0)
     assert flight.parameters["GPS_AUTO_SWITCH"] == 4.0, "with a fix the firmware may fall back by itself again"
-    flight.fly(80.0, images=False)
+    flight.fly(80.0, no_images)
     assert flight.parameters["GPS_AUTO_SWITCH"] == 4.0, "a receiver that may be spoofed is better than none"
     assert flight.sources() == [(True, True), (True, False), (True, True), (True, False), (True, True)]
 
@@ -227,7 +182,7 @@ def test_what_another_vehicle_had_before_is_not_restored_on_this_one() -> None:
 def test_an_unwritable_disk_does_not_keep_a_spoofed_vehicle_on_its_receiver(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
-    flight = Companion(blocked / "state")
+    flight = SpoofedFlight(blocked / "state")
     flight.fly(22.0)
     assert flight.parameters["GPS_PRIMARY"] == 1.0
     flight.disarm()
