@@ -672,6 +672,35 @@ class LinkStatus(Message, frozen=True, kw_only=True):
     detail: str = ""
 
 
+class ServedVehicle(Message, frozen=True, kw_only=True):
+    """Which autopilot the link serves; at every change, and at 1 Hz.
+
+    ``candidates``: not empty: any of these system ids may be the vehicle that carries the camera. Until a CameraVehicle
+    says which, no position leaves and no telemetry is used."""
+
+    sysid: int  # 0: none yet
+    confirmed: bool  # it turns as the camera does, or link.autopilot_sysid names it
+    candidates: list[int] = []
+
+
+class CandidateAttitude(Message, frozen=True, kw_only=True):
+    """Attitude of one of the candidates of ServedVehicle, as in VehicleState."""
+
+    sysid: int
+    yaw_rad: float
+    pitch_rad: float
+    roll_rad: float
+
+
+class CameraVehicle(Message, frozen=True, kw_only=True):
+    """The vehicle that carries the camera: its attitude turns as the images do.
+
+    ``evidence``: log of the likelihood ratio "turns as the images do" over "turns independently", by system id."""
+
+    sysid: int
+    evidence: dict[int, float] = {}
+
+
 class GnssReading(Message, frozen=True, kw_only=True):
     """Position report of a GNSS receiver of the autopilot, at its arrival; monitored only, not fused in flight."""
 
@@ -878,6 +907,9 @@ AnyMessage = (
     | MeasurementVerdict
     | GpsInput
     | LinkStatus
+    | ServedVehicle
+    | CandidateAttitude
+    | CameraVehicle
     | GnssReading
     | GnssInitialPosition
     | GnssVerdict

@@ -57,7 +57,7 @@ class LinkSection(Section, frozen=True, kw_only=True):
     view_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # ghost vehicle at our position on ground_devices; 0: none
     sysid: Annotated[int, Meta(ge=1, le=255)] = 1
     compid: Annotated[int, Meta(ge=1, le=255)] = 197  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
-    autopilot_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: the first autopilot that is received
+    autopilot_sysid: Annotated[int, Meta(ge=0, le=255)] = 0  # 0: the only one, or that of the camera
     signing_key: str = ""  # file with the MAVLink 2 signing key; empty: packets are neither signed nor checked
     gps_id: Annotated[int, Meta(ge=0, le=3)] = 0
     rate_hz: Annotated[float, Meta(ge=5, le=15)] = 10.0  # the autopilot drops messages at shorter intervals

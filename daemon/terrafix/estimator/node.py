@@ -17,6 +17,7 @@ from terrafix.estimator.edge import EstimatorEdge
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameInput, FrameState
 from terrafix.estimator.initialization import ResetReason
+from terrafix.estimator.integrity.camera_vehicle import CameraVehicleTest
 from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.time_offset import TimeOffset
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
@@ -42,6 +43,7 @@ from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpo
 from terrafix.estimator.propagation import PropagationResult
 from terrafix.estimator.smoother_inputs import map_anchor, odometry_link, relocalization_link
 from terrafix.messages import (
+    CandidateAttitude,
     ClaimBudget,
     CovarianceMode,
     EkfDeadReckoning,
@@ -55,6 +57,7 @@ from terrafix.messages import (
     Origin,
     Prediction,
     Relocalization,
+    ServedVehicle,
     SourceEnded,
     ThermalBand,
     VehicleState,
@@ -94,6 +97,7 @@ class EstimatorNode:
         self._flight: EstimatedFlight | None = None  # of the newest estimator ...
         self._poses: PoseEstimator | None = None  # ... and what adds map matches to it
         self._telemetry = Telemetry()
+        self._camera_vehicle = CameraVehicleTest(None if checkpoint is None else checkpoint.camera_vehicle)
         sent_ns = None if checkpoint is None else checkpoint.estimate.t_ns
         self._ahrs = AhrsCorrectionMonitor(self._telemetry, sent_ns)
         self._attitude: Attitude | None = None  # at the newest frame
@@ -117,6 +121,8 @@ class EstimatorNode:
             InitialPosition: self._on_initial_position,
             VehicleState: self._on_vehicle_state,
             Imu: self._on_imu,
+            ServedVehicle: self._on_served_vehicle,
+            CandidateAttitude: self._on_candidate_attitude,
             EkfDeadReckoning: self._on_dead_reckoning,
             Health: self._on_health,
             Odometry: self._on_odometry,
@@ -209,7 +215,16 @@ class EstimatorNode:
     def _on_vehicle_state(self, state: VehicleState) -> Iterable[Message]:
         self._first_ns = state.t_ns if self._first_ns is None else self._first_ns
         self._telemetry.add(state)
+        self._camera_vehicle.on_vehicle_state(state)
         return self._waiting_frames()
+
+    def _on_served_vehicle(self, served: ServedVehicle) -> Iterable[Message]:
+        answer = self._camera_vehicle.on_served(served)
+        return () if answer is None else (answer,)
+
+    def _on_candidate_attitude(self, attitude: CandidateAttitude) -> Iterable[Message]:
+        self._camera_vehicle.on_candidate(attitude)
+        return ()
 
     def _on_imu(self, imu: Imu) -> Iterable[Message]:
         self._telemetry.add_imu(imu)
@@ -265,6 +280,8 @@ class EstimatorNode:
             return
         stamp_ns, time_offset = odometry.t_ns, self._flight.time_offset
         before_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
+        if (camera_vehicle := self._camera_vehicle.on_odometry(odometry, self._estimator.origin.camera)) is not None:
+            yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
         estimator, frame = self._frame_input(self._estimator, odometry)
         follows = not self._relocated and self._note_predicted_frame(estimator)

@@ -17,6 +17,7 @@ from terrafix.estimator.state import CALIBRATION_SIZE, HEADING
 from terrafix.messages import (
     CalibrationEstimate,
     Camera,
+    CameraVehicle,
     GroundPlane,
     InitialPosition,
     LensEstimate,
@@ -52,6 +53,7 @@ class EstimatorCheckpoint(msgspec.Struct, frozen=True):
     calibration: CalibrationEstimate | None = None
     ground: CheckpointGround | None = None
     initial_position: InitialPosition | None = None
+    camera_vehicle: CameraVehicle | None = None
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,7 @@ class CheckpointWriter:
         self._ground: CheckpointGround | None = None
         last = self._checkpoint.load()
         self._initial = None if last is None else last.initial_position  # published once, before take-off
+        self._camera_vehicle = None if last is None else last.camera_vehicle  # published once as well
 
     def poll(self, now_ns: int) -> Iterable[Message]:
         return ()
@@ -168,11 +171,14 @@ class CheckpointWriter:
             self._calibration = message
         elif isinstance(message, InitialPosition):
             self._initial = message
+        elif isinstance(message, CameraVehicle):
+            self._camera_vehicle = message
         elif isinstance(message, MapMatch):
             self._ground = ground_of(message) or self._ground
         elif isinstance(message, NavEstimate) and message.t_ns - self._written_ns >= CHECKPOINT_EVERY_NS:
             self._written_ns = message.t_ns
-            self._checkpoint.save(EstimatorCheckpoint(message, self._calibration, self._ground, self._initial))
+            last = message, self._calibration, self._ground, self._initial, self._camera_vehicle
+            self._checkpoint.save(EstimatorCheckpoint(*last))
 
     def close(self) -> None:
         pass

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core import clock
@@ -17,6 +18,7 @@ from terrafix.link.autopilot.autopilot_prior import AutopilotPrior
 from terrafix.link.autopilot.checkpoint import CheckpointWriter
 from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder
 from terrafix.link.autopilot.packet_decoder import AutopilotPeer
+from terrafix.link.autopilot.telemetry import candidate_attitude
 from terrafix.link.gnss.previous_source import PreviousSourceFile
 from terrafix.link.gnss.source_switch import SourceSwitch
 from terrafix.link.ground_station.links import GroundLinks
@@ -35,6 +37,7 @@ from terrafix.link.output.serial_outputs import open_serial_outputs
 from terrafix.link.pilot_text.statustext import WARNING, statustext
 from terrafix.link.status import Status, StatusLog
 from terrafix.messages import (
+    CameraVehicle,
     GpsInput,
     LinkStatus,
     MapOffset,
@@ -42,6 +45,7 @@ from terrafix.messages import (
     Origin,
     PositionHint,
     PositionSource,
+    ServedVehicle,
     StatusText,
     WallClock,
 )
@@ -53,10 +57,11 @@ WALL_CLOCK_NS = 10 * NS_PER_S  # [tuned]
 TIMESYNC_NS = NS_PER_S
 FAST_TIMESYNC_NS = 100_000_000  # until FAST_TIMESYNC_COUNT responses have arrived [tuned]
 FAST_TIMESYNC_COUNT = 10  # [tuned]
-RESTORE_NS = (
-    2 * NS_PER_S
-)  # longest wait for the autopilot at an ordered stop [spec: runtime/supervisor.py ends it after 5 s]
+# Longest wait for the autopilot at an ordered stop. [spec: runtime/supervisor.py ends it after 5 s]
+RESTORE_NS = 2 * NS_PER_S
 RESTORE_POLL_S = 0.02  # [spec: tick rate of the link, processes.py]
+# Of each further vehicle that may carry the camera: enough for its turns. [measured: docs/decisions/052]
+CANDIDATE_STREAMS_HZ = {mavlink.MAVLINK_MSG_ID_ATTITUDE: 10.0}
 
 
 def open_edge(config: LinkSection, checkpoint_file: Path | None = None, state_dir: Path | None = None) -> "MavlinkEdge":
@@ -100,10 +105,12 @@ class MavlinkEdge:
         checkpoint = self._checkpoint.restored
         self._admission = Admission(config, is_listening=self._connection.is_listening, checkpoint=checkpoint)
         self._served = self._admission.served
-        self._known_reboots = 0  # reboots that were reported to the telemetry
+        self._heights_of = (self._served.sysid, 0)  # vehicle and number of its reboot whose heights the telemetry has
         baud = config.baud if config.device.startswith("/") else None
         self._bandwidth = LinkBandwidth(baud, signed=self._connection.signed)
         self._streams = Streams(self._bandwidth.limit_rates(STREAMS_HZ))
+        self._candidate_streams: dict[int, Streams] = {}  # of the other vehicles that may carry the camera
+        self._reported_vehicle: ServedVehicle | None = None
         self._outputs = PositionOutputs(config.outputs, config.gps_id)
         self._serial_outputs = open_serial_outputs(config)
         self._hints = HintReceiver(config.sysid, config.compid)
@@ -154,6 +161,8 @@ class MavlinkEdge:
         fast = self._timesync_responses < FAST_TIMESYNC_COUNT
         if self._due("timesync", FAST_TIMESYNC_NS if fast else TIMESYNC_NS, now_ns):
             self._send(mavlink.MAVLink_timesync_message(0, self._timesync.request(now_ns)))
+        messages += self._served_vehicle(now_ns)
+        self._request_attitudes(now_ns)
         if self._autopilot.telemetry.connected(now_ns):
             for request in self._requests(now_ns):
                 self._send(request)
@@ -173,9 +182,13 @@ class MavlinkEdge:
                 self._autopilot_prior.on_gps_input(message)
                 self._dead_reckoning.on_gps_input(message)
                 telemetry = self._autopilot.telemetry
-                self._checkpoint.on_fix(self._dead_reckoning.last, telemetry.home_moved_m, telemetry.pressure_zero_m)
+                # Without a last fix a successor first listens for other vehicles, see ServedAutopilot.
+                last = None if self._served.candidates(message.t_ns) else self._dead_reckoning.last
+                self._checkpoint.on_fix(last, telemetry.home_moved_m, telemetry.pressure_zero_m)
                 unix_ms = gps_time.unix_ms(message.time_week, message.time_week_ms)
                 self._checkpoint.on_gps_time(None if unix_ms is None else unix_ms * 1_000_000 - message.t_ns)
+            case CameraVehicle():
+                self._served.confirm(message.sysid)
             case Origin():
                 if message.ground_amsl_m is not None:
                     self._flight_origin = GeodeticPoint(message.lat_deg, message.lon_deg, message.ground_amsl_m)
@@ -231,6 +244,9 @@ class MavlinkEdge:
         if role in (Role.REJECTED, Role.INCONSISTENT):
             return
         kind = message.get_type()
+        if kind == "ATTITUDE" and role in (Role.AUTOPILOT, Role.CANDIDATE) and self._served.is_contested(now_ns):
+            yield from self._on_candidate_attitude(message, now_ns)
+            return
         if kind == "TIMESYNC":
             self._on_timesync(message, sender, role, now_ns)
             return
@@ -245,15 +261,23 @@ class MavlinkEdge:
     def _on_autopilot_packet(self, message: Any, now_ns: int) -> Iterator[Message]:
         """Processes one packet of the served autopilot."""
         kind = message.get_type()
-        if self._admission.reboots != self._known_reboots:
-            self._known_reboots = self._admission.reboots
+        contested, heights_of = self._served.is_contested(now_ns), (self._served.sysid, self._admission.reboots)
+        if self._heights_of != heights_of:
+            if self._heights_of[0] != self._served.sysid:
+                self._streams.restart()
+            self._heights_of = heights_of
             self._autopilot.telemetry.on_reboot()
-        yield from self._autopilot.on_message(message, now_ns, self._own_receiver())
+        if (
+            not contested or kind == "HEARTBEAT"
+        ):  # nothing else of a vehicle without this camera may reach the estimator
+            yield from self._autopilot.on_message(message, now_ns, self._own_receiver())
         if kind == "HEARTBEAT":
             self._checkpoint.on_heartbeat(self._autopilot.telemetry.armed_autopilot, self._served.address)
             firmware = self._autopilot.firmware
             self._streams.set_firmware(firmware, self._bandwidth.limit_rates(streams_of_firmware(firmware)))
         self._streams.on_message(message.get_msgId())
+        if contested:
+            return
         self._switch.on_message(message)
         hint = self._autopilot_prior.on_message(message, now_ns)
         if hint is not None:
@@ -261,6 +285,26 @@ class MavlinkEdge:
         yield from self._dead_reckoning.on_message(message, now_ns, self._own_receiver())
         if kind == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             self._streams.on_command_ack(message.result)
+
+    def _on_candidate_attitude(self, message: Any, now_ns: int) -> Iterator[Message]:
+        """ATTITUDE of one of the vehicles that may carry the camera."""
+        streams = self._candidate_streams.get(message.get_srcSystem(), self._streams)
+        streams.on_message(message.get_msgId())
+        attitude = candidate_attitude(message, now_ns)
+        if attitude is not None:
+            yield attitude
+
+    def _served_vehicle(self, now_ns: int) -> Iterator[ServedVehicle]:
+        """-> which vehicle is served, when that has changed or is due."""
+        served = self._served
+        candidates = sorted(served.candidates(now_ns))
+        by_turns = served.confirmed == served.sysid != 0
+        confirmed = not candidates and (by_turns or bool(self._config.autopilot_sysid))
+        state = ServedVehicle(t_ns=now_ns, sysid=served.sysid, confirmed=confirmed, candidates=candidates)
+        before, self._reported_vehicle = self._reported_vehicle, state
+        changed = before is None or msgspec.structs.replace(before, t_ns=now_ns) != state
+        if self._due("served vehicle", STATUS_NS, now_ns) or changed:
+            yield state
 
     def _own_receiver(self) -> int | None:
         """-> index of the autopilot's GPS instance that carries our GPS_INPUT; None if that is not an output."""
@@ -294,8 +338,9 @@ class MavlinkEdge:
 
     def _send_position(self, gps: GpsInput) -> None:
         """Sends the position to the autopilot first, so that no other output delays it."""
-        for packet in self._outputs.messages(gps, self._autopilot.snapshot(gps.t_ns)):
-            self._send(packet)
+        if not self._served.candidates(gps.t_ns):
+            for packet in self._outputs.messages(gps, self._autopilot.snapshot(gps.t_ns)):
+                self._send(packet)
         for output in self._serial_outputs:
             output.send(gps, gps.t_ns)
         connected = self._autopilot.telemetry.connected(gps.t_ns)
@@ -309,9 +354,22 @@ class MavlinkEdge:
         """-> all requests to the autopilot that are due."""
         sysid = self._served.sysid
         yield from self._streams.requests(sysid, AUTOPILOT_COMPONENT, now_ns)
+        if self._served.candidates(now_ns):
+            return
         yield from self._outputs.requests(self._flight_origin, self._autopilot.snapshot(now_ns), now_ns)
         yield from self._switch.requests(sysid, now_ns)
         yield from self._dead_reckoning.requests(sysid, AUTOPILOT_COMPONENT, now_ns)
+
+    def _request_attitudes(self, now_ns: int) -> None:
+        """Requests ATTITUDE of the other vehicles that may carry the camera."""
+        candidates = self._served.candidates(now_ns)
+        others = candidates.keys() - {self._served.sysid}
+        self._candidate_streams = {
+            sysid: self._candidate_streams.get(sysid) or Streams(CANDIDATE_STREAMS_HZ) for sysid in others
+        }
+        for sysid, streams in self._candidate_streams.items():
+            for request in streams.requests(sysid, AUTOPILOT_COMPONENT, now_ns):
+                self._connection.send(request, to=candidates[sysid])
 
     def _heartbeat(self) -> None:
         self._ground.send_ghost_heartbeat(self._autopilot.telemetry.vehicle_type)

@@ -37,6 +37,7 @@ from terrafix.messages import (
     Origin,
     ProcessEvent,
     SearchState,
+    ServedVehicle,
     StatusText,
     ThermalBand,
     VehicleState,
@@ -93,6 +94,7 @@ class LinkNode:
         self._starts = GnssInitializer(enabled=gnss_start)
         self._prior_request = PriorRequest()
         self._ekf_monitor = EkfStatusMonitor()
+        self._candidates: list[int] = []  # of ServedVehicle
         self._armed: bool | None = None
         self._position_confirmed = False  # the vehicle was disarmed once, or there was a map fix
         self._now_ns = 0
@@ -125,6 +127,7 @@ class LinkNode:
             SearchState: self._on_search_state,
             HintVerdict: self._on_hint_verdict,
             CalibrationFault: self._on_calibration_fault,
+            ServedVehicle: self._on_served_vehicle,
         }
 
     def on(self, message: Message) -> Iterable[Message]:
@@ -231,6 +234,10 @@ class LinkNode:
     def _on_calibration_fault(self, fault: CalibrationFault) -> list[Message]:
         return [statustext(fault.t_ns, CRITICAL if fault.active else INFO, fault_text(fault))]
 
+    def _on_served_vehicle(self, served: ServedVehicle) -> list[Message]:
+        self._candidates = served.candidates
+        return []
+
     def _send(self, now_ns: int) -> Iterator[Message]:
         """-> GpsInput of this send time and texts for the pilot; no GpsInput after 35 s without an estimate."""
         yield from self._update_degradation(now_ns)
@@ -284,6 +291,10 @@ class LinkNode:
 
     def _gps_input(self, now_ns: int) -> GpsInput:
         """-> the accepted estimate, predicted to ``now_ns``, with fix type and accuracies; sets ``_no_fix_reason``."""
+        if self._candidates:
+            self._fix_gate.withdraw()
+            text = f"the camera may be on vehicle {', '.join(map(str, self._candidates))}"
+            return self._no_fix(now_ns, fix_type.NoFixReason(text, "which vehicle?"), -1.0)
         estimate = self._gate.accepted
         if estimate is None:
             reason_text = self._estimator_failure or "no estimate yet"

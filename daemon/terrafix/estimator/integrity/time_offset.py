@@ -44,18 +44,22 @@ class TimeOffset:
         self.applied_s = 0.0
         self._pending: list[Turn] = []  # until attitudes have arrived that are as late as the grid reaches
         # Sums over turns, for each offset of the grid: squares of the residual "visual less reported turn", products of
-        # residual and change of roll, squares of the change of roll.
-        self._residual2, self._residual_roll, self._roll2 = np.zeros((3, len(GRID_S)))
+        # residual and change of roll, squares of the change of roll, squares of the visual and of the reported turn.
+        self._residual2, self._residual_roll, self._roll2, self._turned2 = np.zeros((4, len(GRID_S)))
         self._count = 0.0
 
     def add(self, turn: Turn, telemetry: Telemetry) -> None:
         """A turn between two frames, at their uncorrected time stamps."""
         self._pending.append(turn)
+        self.compare(telemetry, turn.t1_ns)
+
+    def compare(self, telemetry: Telemetry, frame_ns: int) -> None:
+        """Compares the turns for which all attitudes have arrived. ``frame_ns``: time stamp of the newest frame."""
         newest_ns = telemetry.newest_turn_ns
         reach_ns = round(GRID_S[-1] * 1e9) + REPORT_WAIT_NS
         while self._pending and self._pending[0].t1_ns + reach_ns <= newest_ns:
             self._accumulate(self._pending.pop(0), telemetry)
-        while self._pending and self._pending[0].t1_ns + 2 * reach_ns < turn.t1_ns:  # no heading is reported
+        while self._pending and self._pending[0].t1_ns + 2 * reach_ns < frame_ns:  # no heading is reported
             del self._pending[0]
 
     @property
@@ -66,13 +70,35 @@ class TimeOffset:
             np.full(len(GRID_S), UNSTAMPED_SHARE / (GRID_S[-1] - GRID_S[0])),
         )
         if self._count > 0.0:
-            noise = self._residual2 / self._count + MIN_TURN_SIGMA_RAD**2
-            by_mount = self._residual_roll**2 / (self._roll2 + noise / MOUNT_PITCH_SIGMA_RAD**2)
-            log = -0.5 * INDEPENDENT_SHARE * self._count * np.log(noise - by_mount / self._count)
+            log = self._log_likelihood(self._noise)
             likelihood = np.exp(log - log.max())
             stamped, unstamped = stamped * likelihood, unstamped * likelihood
         total = float(stamped.sum() + unstamped.sum())
         return (stamped + unstamped) / total, float(unstamped.sum()) / total
+
+    @property
+    def evidence(self) -> tuple[float, float]:
+        """-> log of the likelihood ratio "the attitude turns as the images do, at an unknown offset" over "it turns
+        independently of them", near 0 without turns; and the same for a single turn."""
+        if self._count == 0.0:
+            return 0.0, 0.0
+        prior = (1.0 - UNSTAMPED_SHARE) * _normal(GRID_S, PRIOR_SIGMA_S)
+        prior += UNSTAMPED_SHARE / (GRID_S[-1] - GRID_S[0])
+        independent = self._turned2 / self._count + MIN_TURN_SIGMA_RAD**2
+        log = self._log_likelihood(self._noise) - self._log_likelihood(independent)
+        total = float(log.max() + np.log(prior / prior.sum() @ np.exp(log - log.max())))
+        return total, total / (0.5 * INDEPENDENT_SHARE * self._count)
+
+    @property
+    def _noise(self) -> np.ndarray:
+        """Variance of the residual turns at each offset, without what an error of the mount pitch explains [rad^2]."""
+        noise = self._residual2 / self._count + MIN_TURN_SIGMA_RAD**2
+        by_mount = self._residual_roll**2 / (self._roll2 + noise / MOUNT_PITCH_SIGMA_RAD**2)
+        return np.asarray(noise - by_mount / self._count)
+
+    def _log_likelihood(self, variance: np.ndarray) -> np.ndarray:
+        """Of the turns so far, whose ``variance`` is that of their own mean square."""
+        return np.asarray(-0.5 * INDEPENDENT_SHARE * self._count * np.log(variance))
 
     @property
     def estimate(self) -> tuple[float, float]:
@@ -105,12 +131,15 @@ class TimeOffset:
         before, after = (telemetry.turned_about(t_ns - shift_ns) for t_ns in (turn.t0_ns, turn.t1_ns))
         if before is None or after is None:
             return
-        residual_rad = (turn.yaw_rad - (after[0] - before[0]) + np.pi) % (2.0 * np.pi) - np.pi
+        reported_rad = after[0] - before[0]
+        residual_rad = (turn.yaw_rad - reported_rad + np.pi) % (2.0 * np.pi) - np.pi
         rolled = np.sin(after[2]) - np.sin(before[2])
         decay = 1.0 - 1.0 / MEMORY_TURNS
         self._residual2 = decay * self._residual2 + residual_rad**2
         self._residual_roll = decay * self._residual_roll + residual_rad * rolled
         self._roll2 = decay * self._roll2 + rolled**2
+        reported_rad = (reported_rad + np.pi) % (2.0 * np.pi) - np.pi  # each end is unwrapped by itself
+        self._turned2 = decay * self._turned2 + turn.yaw_rad**2 + reported_rad**2
         self._count = decay * self._count + 1.0
 
 

@@ -1,6 +1,6 @@
 """Camera motion between two frames from the image alone, levelled with the autopilot's attitude."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,17 +29,39 @@ def visual_motion(pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.
 
     ``pairs`` (N, 4): normalised image points of the keyframe and of the frame; ``before``, ``now``: their attitudes;
     R_b_c (3x3): the configured mount. None where an attitude has no heading or too few rays point down."""
-    if before.yaw_rad is None or now.yaw_rad is None or len(pairs) < MIN_PAIRS:
+    if before.yaw_rad is None or now.yaw_rad is None:
+        return None
+    motion = _ground_motion(pairs, before, now, r_b_c)
+    if motion is None:
+        return None
+    displacement = motion[0]
+    turned = _ratio(pairs[:, 2] + 1j * pairs[:, 3], pairs[:, 0] + 1j * pairs[:, 1])
+    reported_rad = float(np.remainder(now.yaw_rad - before.yaw_rad + np.pi, 2 * np.pi) - np.pi)
+    return VisualMotion(np.array([displacement.real, displacement.imag]), float(np.angle(turned)), reported_rad)
+
+
+def image_turn(pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarray) -> float | None:
+    """-> turn about the vertical from a keyframe to a frame, clockwise [rad], without the headings and heights of both
+    attitudes; a tilt that is not known is taken as level. Otherwise as ``visual_motion``."""
+    tilt_before, tilt_now = (replace(attitude, yaw_rad=0.0) for attitude in (before, now))
+    motion = _ground_motion(pairs, tilt_before, tilt_now, r_b_c)
+    return None if motion is None else -float(np.angle(motion[1]))
+
+
+def _ground_motion(
+    pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarray
+) -> tuple[complex, complex] | None:
+    """-> displacement, and ratio of the points of the frame to those of the keyframe, as complex numbers east + j north
+    in heights above ground."""
+    if len(pairs) < MIN_PAIRS:
         return None
     rays_kf, rays_k = (_rays(pairs[:, i : i + 2], a, r_b_c) for i, a in ((0, before), (2, now)))
     down = (rays_kf[:, 2] < -MIN_DOWN) & (rays_k[:, 2] < -MIN_DOWN)
     if int(down.sum()) < MIN_PAIRS:
         return None
     kf, k = (rays[down, 0] / -rays[down, 2] + 1j * rays[down, 1] / -rays[down, 2] for rays in (rays_kf, rays_k))
-    displacement = complex(kf.mean() - _ratio(k, kf) * k.mean())
-    turned = _ratio(pairs[:, 2] + 1j * pairs[:, 3], pairs[:, 0] + 1j * pairs[:, 1])
-    reported_rad = float(np.remainder(now.yaw_rad - before.yaw_rad + np.pi, 2 * np.pi) - np.pi)
-    return VisualMotion(np.array([displacement.real, displacement.imag]), float(np.angle(turned)), reported_rad)
+    ratio = _ratio(k, kf)
+    return complex(kf.mean() - ratio * k.mean()), ratio
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> complex:

@@ -4,13 +4,24 @@ contradicts earlier telemetry (``TelemetryCheck``)."""
 from collections.abc import Iterator
 from typing import Any
 
+from terrafix.core.clock import NS_PER_S
 from terrafix.core.config import LinkSection
 from terrafix.link.admission.refusals import RejectionLog, RejectionReason
-from terrafix.link.admission.served_autopilot import Role, ServedAutopilot, change_text, pilot_text, status_note
+from terrafix.link.admission.served_autopilot import (
+    Role,
+    ServedAutopilot,
+    camera_texts,
+    change_text,
+    pilot_text,
+    status_note,
+    unclear_text,
+)
 from terrafix.link.admission.telemetry_check import TelemetryCheck
 from terrafix.link.autopilot.checkpoint import LinkCheckpoint
 from terrafix.link.mavlink.transport import Address
 from terrafix.messages import MeasurementVerdict
+
+UNCLEAR_TEXT_NS = 30 * NS_PER_S  # between two texts that name the vehicles [spec: as of prior_request.py]
 
 
 class Admission:
@@ -22,6 +33,7 @@ class Admission:
         self.reboots = 0
         self._reported_sysid = self.served.sysid  # of the served autopilot
         self._sysid_configured = bool(config.autopilot_sysid)
+        self._unclear_text_ns: int | None = None  # time of the last text that names the candidates; None: it is clear
         self._check = TelemetryCheck()
         self._checked_sender = (self.served.sysid, self.served.address)  # of the packets that _check has seen
         self._rejections = RejectionLog()
@@ -43,14 +55,33 @@ class Admission:
             if self._reported_sysid:
                 yield change_text(self._reported_sysid, self.served.sysid)
             self._reported_sysid = self.served.sysid
-        for other in self.served.new_others(now_ns):
-            yield pilot_text(other, self.served.sysid)
+        yield from self._camera_texts(now_ns)
+        if self._unclear_text_ns is None:
+            for other in self.served.new_others(now_ns):
+                yield pilot_text(other, self.served.sysid)
         yield from self._rejections.pilot_texts()
 
     def notes(self, now_ns: int) -> Iterator[str]:
         """-> texts for ``LinkStatus``; may be empty strings."""
-        yield status_note(self.served.others(now_ns), self.served.sysid, sysid_configured=self._sysid_configured)
+        if self.served.is_contested(now_ns):
+            named = ", ".join(map(str, sorted(self.served.candidates(now_ns))))
+            what_to_do = "no position is sent until one turns as the images do; name yours in link.autopilot_sysid"
+            yield f"the camera may be on vehicle {named}: {what_to_do}"
+        else:
+            yield status_note(self.served.others(now_ns), self.served.sysid, sysid_configured=self._sysid_configured)
         yield from self._rejections.notes(now_ns)
+
+    def _camera_texts(self, now_ns: int) -> Iterator[str]:
+        """-> texts when it becomes unclear which vehicle carries the camera, every 30 s while it is, and when it is
+        known."""
+        if self.served.is_contested(now_ns):
+            if self._unclear_text_ns is None or now_ns - self._unclear_text_ns >= UNCLEAR_TEXT_NS:
+                self._unclear_text_ns = now_ns
+                yield unclear_text(self.served.candidates(now_ns))
+        elif self._unclear_text_ns is not None:
+            self._unclear_text_ns = None
+            if self.served.confirmed:
+                yield from camera_texts(self.served.sysid)
 
     def _is_inconsistent(self, message: Any, now_ns: int) -> bool:
         """True if a packet of the autopilot, or of a sender with its id and address, contradicts earlier packets."""

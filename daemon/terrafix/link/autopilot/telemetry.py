@@ -18,7 +18,7 @@ from terrafix.link.autopilot.checkpoint import ArmedAutopilot, LinkCheckpoint
 from terrafix.link.autopilot.pressure_height import PressureHeight
 from terrafix.link.mavlink.diagnosis import FIRMWARE_NAMES
 from terrafix.link.mavlink.timesync import TimeSync
-from terrafix.messages import Imu, ImuSample, VehicleState
+from terrafix.messages import CandidateAttitude, Imu, ImuSample, VehicleState
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000  # three heartbeats [tuned]
 SENSOR_TIMEOUT_NS = 1_000_000_000  # an older height or airspeed is not published with an attitude [tuned]
@@ -132,8 +132,7 @@ class Telemetry:
         return _if_fresh(self._ekf_height, now_ns) if by_pressure_m is None else by_pressure_m
 
     def _vehicle_state(self, message: Any, now_ns: int) -> VehicleState | None:
-        angles_rad = (message.yaw, message.pitch, message.roll)
-        if not all(math.isfinite(a) and abs(a) <= MAX_ATTITUDE_RAD for a in angles_rad):
+        if not _has_angles(message):
             return None
         return VehicleState(
             t_ns=self.measured_ns(message.time_boot_ms * 1_000_000, now_ns),
@@ -170,6 +169,25 @@ class Telemetry:
         if abs(now_ns - local_ns) > MAX_TRANSPORT_NS:
             return now_ns
         return min(local_ns, now_ns)
+
+
+def candidate_attitude(message: Any, now_ns: int) -> CandidateAttitude | None:
+    """-> the attitude in an ATTITUDE message of any vehicle, at its arrival: the clock of one alone is known; None if
+    it is invalid."""
+    if not _has_angles(message):
+        return None
+    return CandidateAttitude(
+        t_ns=now_ns,
+        sysid=message.get_srcSystem(),
+        yaw_rad=math.remainder(message.yaw, math.tau),
+        pitch_rad=message.pitch,
+        roll_rad=message.roll,
+    )
+
+
+def _has_angles(message: Any) -> bool:
+    """True if the angles of an ATTITUDE message are valid."""
+    return all(math.isfinite(a) and abs(a) <= MAX_ATTITUDE_RAD for a in (message.yaw, message.pitch, message.roll))
 
 
 def _if_fresh(reading: tuple[int, float] | None, now_ns: int) -> float | None:

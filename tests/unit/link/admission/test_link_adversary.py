@@ -66,13 +66,14 @@ class Forger:
 
 
 @pytest.mark.slow
-def test_of_two_copters_on_one_port_only_the_first_receives_gps_input() -> None:
+def test_of_two_copters_on_one_port_only_the_served_one_receives_gps_input() -> None:
     port = free_port()
     edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
     ours, theirs = AutopilotPeer(seed=1, sysid=1), AutopilotPeer(seed=2, sysid=2)
     estimates = Estimates()
     ours.start(0, eastward(0.0), to=port)
     published = live(LinkNode(10.0), edge, 1.5, estimates)
+    edge.on_message(m.CameraVehicle(t_ns=0, sysid=1))
     theirs.start(0, eastward(66_000.0), to=port)
     published += live(LinkNode(10.0), edge, SECONDS, estimates)
     first, second = ours.stop(), theirs.stop()

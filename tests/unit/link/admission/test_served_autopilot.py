@@ -33,6 +33,7 @@ pytestmark = pytest.mark.real_time  # the packets go through the kernel
 
 PLACE = (480_000_000, 110_000_000)
 ORIGIN_HERE = mavlink.MAVLink_set_gps_global_origin_message(7, *PLACE, 0)
+CAMERA_ON_7 = m.CameraVehicle(t_ns=0, sysid=7)
 LAST_FIX = LastFix(EkfState(1000, 48.0, 11.0, (0.0,) * 3), 48.0, 11.0, (0.0,) * 3, 3.0, 0.3, frozenset())
 
 
@@ -62,8 +63,9 @@ def hints(published: list[m.Message]) -> list[m.PositionHint]:
 # --- one port, two vehicles ---
 
 
-def test_the_position_is_sent_to_the_first_autopilot_only(port: Port, ours: Speaker, theirs: Speaker) -> None:
+def test_the_position_is_sent_to_the_served_autopilot_only(port: Port, ours: Speaker, theirs: Speaker) -> None:
     port.receives(1 * S, ours, heartbeat())
+    port.edge.on_message(CAMERA_ON_7)
     port.receives(2 * S, theirs, heartbeat())
     theirs.received()
     for tenth in range(21, 50):
@@ -84,6 +86,7 @@ def test_no_position_is_sent_before_an_autopilot_heartbeat(port: Port, ours: Spe
 def test_a_second_vehicle_causes_one_warning_and_another_when_it_returns(
     port: Port, ours: Speaker, theirs: Speaker
 ) -> None:
+    port.edge.on_message(CAMERA_ON_7)
     for second in range(1, 6):
         port.receives(second * S, ours, heartbeat())
         port.receives(second * S + MS, theirs, heartbeat())
@@ -195,20 +198,22 @@ def test_another_vehicle_is_served_after_5_s_of_silence_of_one_that_sent_heartbe
         port.edge.on_message(GPS)
         positions.append(len(ours.received("GPS_INPUT")))
     assert positions == [0, 1]
-    assert port.texts() == ["Terrafix: vehicle 7 on our port gets nothing", "Terrafix: vehicle 7 is served, 9 is not"]
+    assert port.texts() == ["Terrafix: no fix: camera on vehicle 7, 9?", "Terrafix: vehicle 7 is served, 9 is not"]
 
 
 @pytest.mark.parametrize(("first", "other", "changes"), [("heartbeats", "all", True), ("all", "all", False)])
 def test_a_vehicle_with_telemetry_is_served_instead_of_one_that_sends_heartbeats_only(
     port: Port, ours: Speaker, theirs: Speaker, first: str, other: str, changes: bool
 ) -> None:
-    served = []
+    served, sent = [], []
     for second in range(1, 9):
         port.receives(second * S, theirs, armed(), *([attitude(1000 * second)] if first == "all" else []))
         port.receives(second * S + MS, ours, armed(), *([attitude(1000 * second)] if other == "all" else []))
-        port.edge.on_message(GPS)
-        served.append((len(theirs.received("GPS_INPUT")), len(ours.received("GPS_INPUT"))))
-    assert served == ([(1, 0)] * 5 + [(0, 1)] * 3 if changes else [(1, 0)] * 8)
+        port.edge.on_message(msgspec.structs.replace(GPS, t_ns=second * S + 2 * MS))
+        served.append([x.sysid for x in port.published if isinstance(x, m.ServedVehicle)][-1])
+        sent += [*theirs.received("GPS_INPUT"), *ours.received("GPS_INPUT")]
+    assert served == ([9] * 5 + [7] * 3 if changes else [9] * 8)
+    assert len(sent) == 0  # which of the two carries the camera is not known
 
 
 @pytest.mark.parametrize("has_fix", [False, True])
@@ -241,6 +246,7 @@ def test_a_restarted_link_serves_the_address_from_the_checkpoint(
     after = Port(open_edge(config, tmp_path / "link.checkpoint"), ("127.0.0.1", port))
     with Speaker(7) as forger:
         assert states(after.receives(2 * S, forger, armed(), attitude(1000))) == []
+    after.edge.on_message(CAMERA_ON_7)
     after.receives(3 * S, theirs, heartbeat())
     after.edge.on_message(GPS)
     after.edge.close()
