@@ -119,7 +119,7 @@ GPS_INPUT_RULES = (
     Rule(
         "GPS{m}_TYPE",
         lambda v: v != MAV_GPS,
-        lambda _v, _c: None,
+        lambda _v, c: 0.0 if c.other == 2 else None,
         Status.FAIL,
         "both GPS are of type 14, and Terrafix sends for one of them; set the type of the receiver, or 0",
         lambda c, v: f"GPS{c.other}_TYPE" in v,
