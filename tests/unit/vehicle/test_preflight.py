@@ -29,12 +29,13 @@ from terrafix_tools.mission.items import Do, Item, Mission
 from terrafix_tools.preflight import autopilot as conversation
 from terrafix_tools.preflight import computer, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
-from terrafix_tools.preflight.lines import Line, Status, number
+from terrafix_tools.preflight.lines import Line, Status, number, ok
 from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
-from terrafix_tools.preflight.rules import Context
+from terrafix_tools.preflight.rules import ALWAYS, GPS_INPUT_RULES, Context, Rule
 from terrafix_tools.preflight.run import _vehicle_lines, preflight
-from terrafix_tools.sim.autopilot.parameters import FIRMWARE
+from terrafix_tools.sim.autopilot.parameters import FIRMWARE, PLANE_DEFAULTS
 
+OK_LINE = ok("", "")
 ROOT = Path(__file__).resolve().parents[3]
 VEHICLES = ROOT / "config" / "vehicles"
 PAGE = ROOT / "docs" / "autopilot.md"
@@ -42,11 +43,16 @@ PAGE = ROOT / "docs" / "autopilot.md"
 DEFAULTS = FIRMWARE | {
     "AHRS_EKF_TYPE": 3,
     "EK3_ENABLE": 1,
+    "EK3_GLITCH_RAD": 25,
+    "EK3_POSNE_M_NSE": 0.5,
     "EK3_POS_I_GATE": 500,
+    "EK3_SRC_OPTIONS": 1,
     "EK3_SRC1_YAW": 1,
     "EK3_VELNE_M_NSE": 0.5,
     "EK3_VEL_I_GATE": 500,
+    "FS_EKF_ACTION": 1,
     "FS_EKF_THRESH": 0.8,
+    **{f"GPS{n}_POS_{axis}": 0 for n in (1, 2) for axis in "XYZ"},
     "GPS_HDOP_GOOD": 140,
     "SERIAL1_PROTOCOL": 2,
     "SERIAL1_BAUD": 57,
@@ -91,9 +97,10 @@ def test_the_presets_pass_all_rules(name: str) -> None:
     assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
 
 
-def test_the_preset_with_a_real_receiver_passes_all_rules() -> None:
-    values = DEFAULTS | preset("second-gps") | {"EK3_GPS_CHECK": 23}
-    lines = lines_by_check(values, context(gps_id=1))
+@pytest.mark.parametrize("plane", [True, False])
+def test_the_preset_with_a_real_receiver_passes_all_rules(plane: bool) -> None:
+    values = DEFAULTS | (PLANE_DEFAULTS if plane else {}) | preset("second-gps")
+    lines = lines_by_check(values, context(plane=plane, gps_id=1))
     assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
 
 
@@ -119,6 +126,58 @@ def test_the_page_gives_the_reason_of_each_value_of_a_preset(name: str) -> None:
             f"{parameter}: the page has another value"
         )
         assert len(rows[parameter][2]) > 10
+
+
+def rules_of(name: str) -> tuple[dict[str, Rule], Context]:
+    """-> parameter -> rule for a vehicle with this file, and its context."""
+    at = context(plane=name != "copter", gps_id=int(name == "second-gps"))
+    return {rule.name.format(n=at.gps, m=at.other): rule for rule in (*GPS_INPUT_RULES, *ALWAYS)}, at
+
+
+@pytest.mark.parametrize("name", ["plane", "copter", "second-gps"])
+def test_each_value_of_a_file_is_the_one_that_preflight_sets(name: str) -> None:
+    rules, at = rules_of(name)
+    for parameter, value in preset(name).items():
+        assert rules[parameter].valid(value), parameter
+        assert rules[parameter].fix(FIRMWARE.get(parameter, value), at) == value, parameter
+
+
+def test_the_page_has_a_valid_value_for_each_rule() -> None:
+    rows = {
+        parameter: line.split("|")[2]
+        for line in PAGE.read_text().splitlines()
+        if line.startswith("| `")
+        for parameter in re.findall(r"`([A-Z0-9_]+)`", line.split("|")[1])
+    }
+    rules = {name: rule for name, rule in rules_of("plane")[0].items() if "{m}" not in rule.name}
+    for parameter, rule in rules.items():
+        values = [float(v) for v in re.findall(r"-?[0-9]+(?:\.[0-9]+)?", rows[parameter])]
+        assert values and rule.valid(values[0]), f"{parameter}: the page has {rows[parameter]}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "link", "name", "new"),
+    [
+        ({"GPS2_TYPE": 14}, {}, "GPS2_TYPE", 0),
+        ({"GPS1_TYPE": 14, "GPS2_TYPE": 14}, {"gps_id": 1}, "GPS1_TYPE", None),
+        ({"EK3_SRC2_VELXY": 6, "EK3_SRC_OPTIONS": 1}, {}, "EK3_SRC_OPTIONS", 0),
+        ({"EK3_SRC2_VELXY": 5, "EK3_SRC_OPTIONS": 10}, {}, "EK3_SRC_OPTIONS", 2),
+        ({"GPS1_POS_X": 0.3}, {}, "GPS1_POS_X", 0),
+        ({"GPS2_POS_Z": -0.1}, {"gps_id": 1}, "GPS2_POS_Z", 0),
+        ({"FS_EKF_ACTION": 0}, {}, "FS_EKF_ACTION", 1),
+        ({"EK3_POSNE_M_NSE": 5}, {}, "EK3_POSNE_M_NSE", 0.5),
+        ({"EK3_GLITCH_RAD": 0}, {}, "EK3_GLITCH_RAD", 25),
+        ({"EK3_SRC1_VELZ": 0}, {}, "EK3_SRC1_VELZ", 3),
+    ],
+)
+def test_parameters_that_spoil_gps_input_are_named(
+    changes: dict[str, float], link: dict[str, Any], name: str, new: float | None
+) -> None:
+    before = DEFAULTS | preset("second-gps" if link else "copter")
+    at = context(plane=False, **link)
+    assert lines_by_check(before, at).get(name, OK_LINE).status is Status.OK
+    line = lines_by_check(before | changes, at)[name]
+    assert line.status is not Status.OK and (None if line.change is None else line.change.new) == new
 
 
 TWO_PORTS = DEFAULTS | {"SERIAL2_PROTOCOL": 2}
@@ -150,15 +209,12 @@ def test_only_parameters_of_the_firmware_version_are_requested() -> None:
     assert "MAV2_OPTIONS" in new and "SERIAL2_OPTIONS" not in new
 
 
-def test_the_firmware_version_comes_from_autopilot_version(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_firmware_version_comes_from_autopilot_version() -> None:
     firmwares: list[tuple[int, int]] = []
-    monkeypatch.setattr(
-        "terrafix_tools.preflight.run.parameter_names", lambda at: firmwares.append(at.firmware) or parameter_names(at)
-    )
     for version in (4 << 24 | 6 << 16, 4 << 24 | 7 << 16):
         with Autopilot(LinkSection(), GroundAutopilot(TWO_PORTS, version=version)) as autopilot:
             autopilot.connect()
-            list(_vehicle_lines(autopilot, Config()))
+            firmwares.append(_vehicle_lines(autopilot, Config())[1].firmware)
     assert firmwares == [(4, 6), (4, 7)]
 
 
@@ -351,6 +407,22 @@ def test_write_sets_wrong_parameters_and_saves_the_previous_values(wired: Any, t
     saved = dict(line.split(",") for line in Path(output["saved_to"]).read_text().splitlines())
     assert {name: float(value) for name, value in saved.items()} == {name: DEFAULTS[name] for name in saved}
     assert set(saved) == {change["name"] for change in output["written"]} == set(there.parameters_set)
+
+
+@pytest.mark.parametrize("wrong", [{}, {"GPS1_TYPE": 14, "GPS2_TYPE": 14}])
+def test_after_writing_the_parameters_are_read_back_and_checked_again(
+    wired: Any, tmp_path: Path, wrong: dict[str, float]
+) -> None:
+    """Of two receivers that are both GPS_INPUT the rule does not apply any more."""
+    wired(GroundAutopilot(DEFAULTS | wrong))
+    arguments = ["preflight", "--autopilot-only", "--out", str(tmp_path)]
+    before = CliRunner().invoke(app, arguments)
+    written = CliRunner().invoke(app, [*arguments, "--write", "--yes"])
+    assert before.exit_code == 1 and " 0 failures" not in before.output
+    assert written.exit_code == 0 and written.output.rstrip().endswith(" 0 failures")
+    _, _, after = written.output.partition("Read back:")
+    assert "GPS1_DELAY_MS" in after and "FAIL" not in after
+    assert "0 failures" in CliRunner().invoke(app, arguments).output
 
 
 def test_without_confirmation_nothing_is_set(wired: Any, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ GPS, BARO, COMPASS, EXTERNAL_NAV = 3, 1, 1, 6  # EK3_SRCn_*
 POSITION_ACCURACY, GPS_ARMING, NO_DCM = 8, 8, 1  # bits of EK3_GPS_CHECK, ARMING_CHECK and _SKIPCHK, AHRS_OPTIONS
 ALL_BUT_GPS = 1048566  # ARMING_CHECK
 SKIPS_CHECKS = (4, 7)  # from this firmware on ARMING_SKIPCHK has the checks to skip, instead of those to run
+FUSE_ALL, SET_PER_CORE = 1, 8  # bits of EK3_SRC_OPTIONS that use other source sets than the active one
 DELAY_MS = (1.0, 50.0)
 
 
@@ -72,13 +73,36 @@ def _copter(context: Context, _values: Values) -> bool:
     return not context.plane
 
 
+def _both_are_ours(context: Context, values: Values) -> bool:
+    return values.get(f"GPS{context.other}_TYPE") == MAV_GPS
+
+
+def _other_sets_have_velocity(_context: Context, values: Values) -> bool:
+    """A source set besides the first has another velocity than GPS."""
+    return any(values.get(f"EK3_SRC{k}_VELXY", 0.0) not in (0.0, GPS) for k in (2, 3))
+
+
 def _has_receiver(context: Context, values: Values) -> bool:
     """There is also a real receiver."""
     return values.get(f"GPS{context.other}_TYPE", 0.0) > 0
 
 
+NO_FIX_ON_THE_GROUND = (
+    "arming requires a 3D fix of every GPS, all within 50 m; that of Terrafix is coarse or missing on the ground"
+)
+ANTENNA = "GPS_INPUT is the position of the vehicle; the filter would subtract this lever arm once more"
+
 GPS_INPUT_RULES = (
     Rule("GPS{n}_TYPE", _one_of(MAV_GPS), _constant(MAV_GPS), Status.FAIL, "only type 14 accepts GPS_INPUT"),
+    Rule(
+        "GPS{m}_TYPE",
+        lambda v: v != MAV_GPS,
+        lambda _v, c: 0.0 if c.other == 2 else None,
+        Status.FAIL,
+        "both are GPS_INPUT and only one is sent: the other never has a fix, and arming waits for it",
+        _both_are_ours,
+    ),
+    *(Rule(f"GPS{{n}}_POS_{axis}", _one_of(0), _constant(0), Status.WARN, ANTENNA) for axis in "XYZ"),
     Rule(
         "GPS{n}_DELAY_MS",
         lambda v: DELAY_MS[0] <= v <= DELAY_MS[1],
@@ -110,7 +134,15 @@ GPS_INPUT_RULES = (
         Status.FAIL,
         "velocity is sent; without it the filter follows a wrong position within seconds",
     ),
-    Rule("EK3_SRC1_VELZ", _one_of(0, GPS), _constant(GPS), Status.WARN, "vertical velocity is sent"),
+    Rule("EK3_SRC1_VELZ", _one_of(GPS), _constant(GPS), Status.WARN, "vertical velocity is sent"),
+    Rule(
+        "EK3_SRC_OPTIONS",
+        lambda v: not int(v) & (FUSE_ALL | SET_PER_CORE),
+        lambda v, _c: float(int(v) & ~(FUSE_ALL | SET_PER_CORE)),
+        Status.WARN,
+        "bits 0 and 3 fuse the velocity of EK3_SRC2 or EK3_SRC3 as well, which is not GPS",
+        _other_sets_have_velocity,
+    ),
     Rule(
         "EK3_GPS_CHECK",
         lambda v: not int(v) & POSITION_ACCURACY,
@@ -137,6 +169,20 @@ GPS_INPUT_RULES = (
         "EK3_POS_I_GATE", lambda v: 300 <= v <= 1000, _constant(500), Status.WARN, "hundredths of sigma of our accuracy"
     ),
     Rule(
+        "EK3_POSNE_M_NSE",
+        lambda v: 0.1 <= v <= 1.0,
+        _constant(0.5),
+        Status.WARN,
+        "the least position accuracy that the filter believes: above, our better ones count as this",
+    ),
+    Rule(
+        "EK3_GLITCH_RAD",
+        lambda v: 10 <= v <= 100,
+        _constant(25),
+        Status.WARN,
+        "0 clips a wrong position instead of rejecting it, a large one keeps rejecting the right one",
+    ),
+    Rule(
         "GPS_HDOP_GOOD",
         lambda v: v >= 110,
         _constant(140),
@@ -149,7 +195,7 @@ GPS_INPUT_RULES = (
         lambda v: v != 1 and not int(v) & GPS_ARMING,
         _constant(ALL_BUT_GPS),
         Status.WARN,
-        "arming requires a 3D fix of every GPS, and Terrafix has none on the ground",
+        NO_FIX_ON_THE_GROUND,
         lambda c, v: _has_receiver(c, v) and c.firmware < SKIPS_CHECKS,
     ),
     Rule(
@@ -157,7 +203,7 @@ GPS_INPUT_RULES = (
         lambda v: bool(int(v) & GPS_ARMING),
         lambda v, _c: float(int(v) | GPS_ARMING),
         Status.WARN,
-        "arming requires a 3D fix of every GPS, and Terrafix has none on the ground",
+        NO_FIX_ON_THE_GROUND,
         lambda c, v: _has_receiver(c, v) and c.firmware >= SKIPS_CHECKS,
     ),
 )
@@ -204,6 +250,14 @@ ALWAYS = (
         _constant(0.8),
         Status.WARN,
         "0 switches the failsafe for a lost position off",
+        _copter,
+    ),
+    Rule(
+        "FS_EKF_ACTION",
+        lambda v: v > 0,
+        _constant(1),
+        Status.WARN,
+        "0 only reports a lost position, and the mode goes on without one",
         _copter,
     ),
 )

@@ -81,13 +81,8 @@ class _Checks:
     saved_to: str = ""
 
     def result(self) -> Preflight:
-        """``ready`` disregards failures that a written change has fixed."""
         return Preflight(
-            ready=all(
-                line.status is not Status.FAIL
-                for line in self.lines
-                if line.change not in self.written or line.change is None
-            ),
+            ready=all(line.status is not Status.FAIL for line in self.lines),
             lines=self.lines,
             written=self.written,
             saved_to=self.saved_to,
@@ -104,8 +99,9 @@ def _check_autopilot(
         autopilot.connect()
         if write_to is not None and autopilot.armed:
             raise UsageError("the autopilot is armed; disarm it before parameters are set")
-        vehicle_lines = list(_vehicle_lines(autopilot, config))
-        checks.lines += vehicle_lines
+        vehicle_lines, context = _vehicle_lines(autopilot, config)
+        parameters = _parameter_lines(autopilot, context)
+        checks.lines += [*vehicle_lines, *parameters]
         if checks.mission is None:
             on_board = folder / "mission on board"
             none = vehicle.save_mission(autopilot, on_board)
@@ -113,12 +109,17 @@ def _check_autopilot(
             checks.mission = on_board if none is None else None
         if not quiet:
             show(checks.lines)
-        changes = proposed_changes(vehicle_lines)
+        changes = proposed_changes(parameters)
         if write_to is not None and changes and (confirmed or _confirmed(changes)):
             checks.saved_to = str(_save(changes, write_to))
             for change in changes:
                 autopilot.write(change.name, change.new)
                 checks.written.append(change)
+            after = _parameter_lines(autopilot, context)
+            checks.lines = [line for line in checks.lines if line not in parameters] + after
+            if not quiet:
+                typer.echo("\nRead back:")
+                show([line for line in after if line not in parameters])
 
 
 def show(lines: list[Line]) -> None:
@@ -136,13 +137,17 @@ def _with_options(config: Config, link: str, map_path: Path | None) -> Config:
     return config
 
 
-def _vehicle_lines(autopilot: Autopilot, config: Config) -> list[Line]:
+def _vehicle_lines(autopilot: Autopilot, config: Config) -> tuple[list[Line], Context]:
+    """-> lines about the autopilot, and what its parameters are checked with."""
     round_trip_ms = autopilot.round_trip_ms()
     lines = list(vehicle.check_lines(autopilot, config.link, round_trip_ms))
     delay_ms = vehicle.delay_advice_ms(config.link, round_trip_ms)
     firmware = vehicle.firmware_version(autopilot.newest.get(("AUTOPILOT_VERSION", autopilot.sysid)))
-    context = Context(config.link, autopilot.plane, autopilot.sysid, delay_ms, firmware)
-    return lines + list(check_parameters(autopilot.read(parameter_names(context)), context))
+    return lines, Context(config.link, autopilot.plane, autopilot.sysid, delay_ms, firmware)
+
+
+def _parameter_lines(autopilot: Autopilot, context: Context) -> list[Line]:
+    return list(check_parameters(autopilot.read(parameter_names(context)), context))
 
 
 def _confirmed(changes: list[Change]) -> bool:
