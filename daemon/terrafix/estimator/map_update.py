@@ -27,7 +27,7 @@ from terrafix.estimator.measurements.map_pose import (
     levelled_innovation,
 )
 from terrafix.estimator.models.motion_model import unknown_motion_cov
-from terrafix.estimator.propagation import STEP_SHARE
+from terrafix.estimator.propagation import MOTION_TIMEOUT_S, STEP_SHARE
 from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import MapMatch, Verdict
 
@@ -193,7 +193,7 @@ class MapUpdate:
     def _accept(self, match: MapMatch, t_s: float, here_m: np.ndarray) -> None:
         state = self._state
         self._fixes.add(t_s, here_m)
-        state.image_jump_m = None
+        state.image_jump = None
         state.last_seen_s = max(state.last_seen_s, t_s)
         state.last_fix_s = self._fixes.newest_s
         self.hypotheses.on_match_accepted()
@@ -213,8 +213,9 @@ class MapUpdate:
         run, other = self._rejected, self.hypotheses.other
         claim_m2 = tangent_to_world(predicted_cov, predicted.rotation().matrix())[HORIZONTAL, HORIZONTAL]
         here_m, coarse = predicted.translation()[:2], match.position_only
-        if not run.offsets_m and state.image_jump_m is not None:  # the images moved as far from the estimate: a witness
-            run.add(state.image_jump_m, here_m, position_only=coarse, t_s=t_s, cov_m2=claim_m2)
+        jump = state.image_jump
+        if not run.offsets_m and jump is not None and 0.0 <= t_s - jump[0] < MOTION_TIMEOUT_S:  # the images say so too
+            run.add(jump[1], here_m, position_only=coarse, t_s=jump[0], cov_m2=claim_m2)
         agrees = run.add(offset, here_m, position_only=coarse, t_s=t_s, cov_m2=claim_m2)
         if not match.position_only and not agrees:  # those that agree with each other support another position
             self.hypotheses.map_consistency.add_rejected(offset)

@@ -45,19 +45,28 @@ class InnovationRun:
     ) -> bool:
         """Adds a fix at ``node``, with the estimate at ``p_m`` (2,) and the claim ``cov_m2`` (2, 2), at ``t_s``. ->
         whether it agrees with the run. If not, the run is cleared and the fix begins a new one. An estimate whose claim
-        grows from fix to fix does not know its velocity, and its offset may grow by as much."""
+        grows from fix to fix does not know its velocity: the second offset may be farther off by as much, and those
+        after it where the two lead to."""
         fix = _Fix(offset_m, p_m + offset_m, t_s, np.zeros((2, 2)) if cov_m2 is None else cov_m2)
-        if self._first is not None:
-            grown_m2 = max(float(np.linalg.eigvalsh(fix.cov_m2 - self._first.cov_m2)[-1]), 0.0)
-            apart_m = float(np.hypot(*(offset_m - np.mean(self.offsets_m, axis=0))))
-            if apart_m > np.sqrt(CONSISTENT_M**2 + GATE[2] * grown_m2):
-                self.clear()
+        if self._first is not None and not self._agrees(fix):
+            self.clear()
         agrees = bool(self.offsets_m)
         self._first, self._last = self._first or fix, fix
         self.offsets_m.append(offset_m)
         self._estimates.append((node, p_m))
         self.poses += not position_only
         return agrees
+
+    def _agrees(self, fix: "_Fix") -> bool:
+        assert self._first is not None and self._last is not None
+        if float(np.hypot(*(fix.offset_m - np.mean(self.offsets_m, axis=0)))) <= CONSISTENT_M:
+            return True
+        grown_m2 = max(float(np.linalg.eigvalsh(fix.cov_m2 - self._last.cov_m2)[-1]), 0.0)
+        if len(self.offsets_m) == 1:
+            apart_m, limit_m = fix.offset_m - self._last.offset_m, float(np.sqrt(CONSISTENT_M**2 + GATE[2] * grown_m2))
+            return float(np.hypot(*apart_m)) <= limit_m
+        led_to_m = self._last.offset_m + self.drift_mps * (fix.t_s - self._last.t_s)
+        return grown_m2 > 0.0 and float(np.hypot(*(fix.offset_m - led_to_m))) <= CONSISTENT_M
 
     @property
     def drift_mps(self) -> np.ndarray:

@@ -23,7 +23,7 @@ from terrafix.estimator.measurements.heading import heading_innovation
 from terrafix.estimator.measurements.keyframe_link import KeyframeLink, by_link, refused
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
-from terrafix.estimator.state import HEADING, HEIGHT, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
+from terrafix.estimator.state import HEADING, HEIGHT, HORIZONTAL, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import CovarianceMode, Odometry, Verdict
 
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
@@ -97,7 +97,7 @@ class OdometryMeasurement:
             frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=moves)
             if frozen or not motion.passes_gate:
                 verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
-                state.image_jump_m = None if frozen else motion.residual_m[:2]
+                state.image_jump = None if frozen else (t_s, motion.residual_m[HORIZONTAL])
                 return Sighting(verdict, None, alone, innovation=innovation)
             if not fragment.confirmed:
                 self._weigh_fragment(fragment, frame, answer, before, motion)
