@@ -106,6 +106,8 @@ class FilterState:
         self.has_height = False
         self.began_s = 0.0
         self.newest_odometry: Odometry | None = None  # as vision published it
+        # Time of the newest implausible odometry, and (2,) by which it was off the prediction, east and north.
+        self.image_jump: tuple[float, np.ndarray] | None = None  # None: none since a match
         self.velocity_cov = np.zeros((MOTION_SIZE, MOTION_SIZE))  # of V of the newest node
         self.lens_sigma = radial_k1_sigma(origin.camera)
         self.node_of: dict[int, int] = {}  # frame -> node, for nodes in the window

@@ -60,6 +60,7 @@ class ResetReason(StrEnum):
     HEADING_KNOWN = "a heading is reported again"
     HEADING_UNKNOWN = "unseen motion without a reported heading"
     MOTION_TIMEOUT = "odometry contradicts velocity"
+    VELOCITY = "odometry innovations of one sign"
     UNMEASURED_TAKE_OFF = "in flight after a take-off that nothing measured"
     TOO_LOW = "height below that of map matching"
     MAP_MATCH = "map match"

@@ -27,7 +27,7 @@ from terrafix.estimator.measurements.map_pose import (
     levelled_innovation,
 )
 from terrafix.estimator.models.motion_model import unknown_motion_cov
-from terrafix.estimator.propagation import STEP_SHARE
+from terrafix.estimator.propagation import MOTION_TIMEOUT_S, STEP_SHARE
 from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import MapMatch, Verdict
 
@@ -193,6 +193,7 @@ class MapUpdate:
     def _accept(self, match: MapMatch, t_s: float, here_m: np.ndarray) -> None:
         state = self._state
         self._fixes.add(t_s, here_m)
+        state.image_jump = None
         state.last_seen_s = max(state.last_seen_s, t_s)
         state.last_fix_s = self._fixes.newest_s
         self.hypotheses.on_match_accepted()
@@ -206,10 +207,16 @@ class MapUpdate:
         wrong."""
         state = self._state
         predicted = state.graph.state(node).pose
-        position = measurement.position_innovation(predicted, state.covariance(node))
+        predicted_cov, t_s = state.covariance(node), state.graph.time_of(node)
+        position = measurement.position_innovation(predicted, predicted_cov)
         offset, apart = position.residual, position.covariance
         run, other = self._rejected, self.hypotheses.other
-        agrees = run.add(offset, predicted.translation()[:2], position_only=match.position_only)
+        claim_m2 = tangent_to_world(predicted_cov, predicted.rotation().matrix())[HORIZONTAL, HORIZONTAL]
+        here_m, coarse = predicted.translation()[:2], match.position_only
+        jump = state.image_jump
+        if not run.offsets_m and jump is not None and 0.0 <= t_s - jump[0] < MOTION_TIMEOUT_S:  # the images say so too
+            run.add(jump[1], here_m, position_only=coarse, t_s=jump[0], cov_m2=claim_m2)
+        agrees = run.add(offset, here_m, position_only=coarse, t_s=t_s, cov_m2=claim_m2)
         if not match.position_only and not agrees:  # those that agree with each other support another position
             self.hypotheses.map_consistency.add_rejected(offset)
         height = float(measurement.pose.translation()[UP]) - state.terrain.ground_m
@@ -246,6 +253,7 @@ class MapUpdate:
             bias[HEIGHT] -= float(measurement.pose.translation()[UP] - was.pose.translation()[UP])
         bias_cov = state.covariances.calibration(state.graph.newest)
         velocity, velocity_cov = now.velocity, RESTART_INFLATION * state.covariances.velocity(state.graph.newest)
+        velocity_cov[HORIZONTAL, HORIZONTAL] += np.outer(self._rejected.drift_mps, self._rejected.drift_mps)
         if state.yaw_gauge is not None:  # it was a velocity in gauge-fixed axes
             velocity, velocity_cov, state.yaw_gauge = np.zeros(MOTION_SIZE), unknown_motion_cov(), None
         assert state.last is not None

@@ -14,9 +14,10 @@ from terrafix.estimator.graph.pose_graph import NewNode
 from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffDetector, continue_from, start_at
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation, ScalarInnovation
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
+from terrafix.estimator.integrity.signed_innovations import SignedInnovations
 from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
-from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
+from terrafix.estimator.measurements.attitude_height import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning, DeadReckoningAid
 from terrafix.estimator.measurements.heading import HEADING_GATE_SIGMAS, heading_innovation
@@ -45,6 +46,7 @@ from terrafix.estimator.state import (
     DELTA_MOTION,
     DELTA_P,
     HEADING,
+    HORIZONTAL,
     MOTION_SIZE,
     TRANSLATION,
     UP,
@@ -57,7 +59,6 @@ from terrafix.messages import CovarianceMode, Verdict
 STEP_SHARE = 0.04  # of a step: error of odometry over real ground, for the point mass filter of the anchor [tuned]
 STEP_FLOOR_M = 0.5  # [tuned]
 MOTION_TIMEOUT_S = 5.0  # of a vehicle with inertial aiding alone [spec: EKF2_NOAID_TOUT of PX4]
-TURN_UNSEEN_RAD = 0.3  # 1-sigma of the heading of an unseen frame without a reported one [tuned]
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,7 @@ class Propagation:
         self._aids = (self._dead_reckoning, *(make_aid(state) for make_aid in AID_SOURCES))
         self._height_gate, self._heading_gate = InnovationGate(HEIGHT_GATE_SIGMAS), InnovationGate(HEADING_GATE_SIGMAS)
         self._motion_refused_s: float | None = None  # time of the first of the impossible motions in a row
+        self._signed = SignedInnovations()  # of odometry that is fused
 
     def advance(self, frame: FrameInput) -> PropagationResult:
         """A new node for ``frame``, or a new graph that begins with it."""
@@ -225,6 +227,12 @@ class Propagation:
             step.predicted_cov[DELTA_P, DELTA_P] += unknown_motion_cov()[VELOCITY, VELOCITY] * dt_s**2
             detail = f"odometry contradicts velocity for {MOTION_TIMEOUT_S:.0f} s"
             return self._continue(step, verdict, _reset_verdict(ResetReason.MOTION_TIMEOUT, detail))
+        if self._is_velocity_wrong(step.sighting) and step.increment is not None:
+            off_m, self._signed = self._signed.sum_m, SignedInnovations()
+            step.predicted_cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
+            step.predicted_cov[HORIZONTAL, HORIZONTAL] += np.outer(off_m, off_m)
+            detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
+            return self._continue(step, verdict, _reset_verdict(ResetReason.VELOCITY, detail))
         above_m = None if step.known is None else float(step.predicted_m[UP]) - state.terrain.ground_m
         if self._take_off.was_unmeasured(step.increment, above_m):
             # With the speed known at both ends a graph would be too sure of the distance between them.
@@ -341,7 +349,8 @@ class Propagation:
         node = state.graph.state(parent)
         r_parent = node.pose.rotation().matrix()
         r_w_c = state.camera.expected(attitude, node.bias, r_parent)
-        yaw_sigma = TURN_UNSEEN_RAD if attitude.yaw_rad is None else np.radians(state.origin.yaw_sigma_deg)
+        reported_rad = np.hypot(np.radians(state.origin.yaw_sigma_deg), attitude.turned_rad)
+        yaw_sigma = TURN_UNSEEN_RAD if attitude.yaw_rad is None else reported_rad
         turn = UNKNOWN_ATTITUDE_RAD + yaw_sigma
         cov = np.diag([turn, turn, turn, 0.0, 0.0, 0.0]) ** 2
         cov[TRANSLATION, TRANSLATION] = r_w_c.T @ step.predicted_cov[DELTA_P, DELTA_P] @ r_w_c
@@ -484,6 +493,14 @@ class Propagation:
         if not gate.rejects(residual, sigma, self._state.last_fix_s):
             return None
         return FusionVerdict(name, Verdict.IMPLAUSIBLE, Innovation.scalar(residual, sigma, gate.gate_sigmas))
+
+    def _is_velocity_wrong(self, sighting: Sighting) -> bool:
+        """Whether the innovations of odometry have kept one sign for so long that velocity is what is wrong."""
+        innovation = sighting.motion_innovation
+        if sighting.fused is None or innovation is None or sighting.begins_disconnected:
+            return False
+        self._signed.add(innovation.residual_m[HORIZONTAL], innovation.cov_m2[HORIZONTAL, HORIZONTAL])
+        return self._signed.alarm
 
     def _is_motion_timed_out(self, sighting: Sighting, t_s: float) -> bool:
         """Whether impossible motions have gone on for so long that velocity may be what is wrong."""

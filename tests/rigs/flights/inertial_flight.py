@@ -43,12 +43,13 @@ ORIGIN = msgspec.structs.replace(STEADY_ORIGIN, yaw_sigma_deg=3.0, agl_sigma_m=3
 
 
 class InertialFlight:
-    """One frame per second. ``messages_by_frame[i]``: telemetry since the previous frame, then odometry and map match.
+    """One frame in ``frame_every`` steps: one per second. ``messages_by_frame[i]``: telemetry since the previous frame,
+    then odometry and map match.
 
     Truth per frame: ``poses`` (R_w_c, position of the camera in ENU relative to the start coordinate),
     ``velocity_mps`` (ENU)."""
 
-    def __init__(self, seed: int, seconds: int = 70) -> None:
+    def __init__(self, seed: int, seconds: int = 70, frame_every: int = FRAME_EVERY) -> None:
         rng = np.random.default_rng([seed, 78])
         mission = course(seed, 40.0 * seconds, Box(-1500.0, -1500.0, 1500.0, 1500.0), PLACE, agl_m=120.0)
         plane = Plane(mission, PLACE, lambda e, n: 0.0, wind=Wind(5.4, 1.0), seed=seed)
@@ -82,13 +83,13 @@ class InertialFlight:
                 samples: list[ImuSample] = [(t_ns - at_ns, *values.tolist()) for at_ns, values in batch]
                 telemetry.append(Imu(t_ns=t_ns, source="simulated", samples=samples))
                 batch = []
-            if i % FRAME_EVERY == 0:
+            if i % frame_every == 0:
                 self.poses.append((state.r_w_b() @ mount, state.p_b_in_w_m - np.array([*start, 0.0])))
                 self.velocity_mps.append(state.velocity_enu_mps)
                 frame_id = len(self.messages_by_frame)
                 messages = [*telemetry, self._odometry(frame_id, t_ns, rng)]
                 if frame_id and frame_id % FIX_EVERY == 0:
-                    messages.append(self._fix(frame_id, t_ns, rng))
+                    messages.append(self.fix(frame_id, t_ns, rng))
                 self.messages_by_frame.append(messages)
                 telemetry = []
 
@@ -98,6 +99,12 @@ class InertialFlight:
                 t_ns=t_ns, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True, fragment_id=0
             )
         keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
+        return self.registered(i, keyframe, t_ns, rng, becomes_keyframe=i % KEYFRAME_EVERY == 0)
+
+    def registered(
+        self, i: int, keyframe: int, t_ns: int, rng: np.random.Generator, *, becomes_keyframe: bool
+    ) -> Odometry:
+        """Odometry of frame ``i`` against the frame ``keyframe``."""
         keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
         frame_xy = apply(homography(self.poses[keyframe], self.poses[i]), keyframe_xy) + rng.normal(
             0.0, SIGMA_NORM, keyframe_xy.shape
@@ -111,11 +118,11 @@ class InertialFlight:
             sigma_norm=SIGMA_NORM,
             inliers=PAIRS,
             tracked=PAIRS,
-            becomes_keyframe=i % KEYFRAME_EVERY == 0,
+            becomes_keyframe=becomes_keyframe,
             fragment_id=0,
         )
 
-    def _fix(self, i: int, t_ns: int, rng: np.random.Generator) -> MapMatch:
+    def fix(self, i: int, t_ns: int, rng: np.random.Generator) -> MapMatch:
         r_w_c, p_m = self.poses[i]
         error = rng.normal(0.0, np.hypot(FIX_SIGMAS, [0.0, 0.0, ROOFS * p_m[2], 0.0, 0.0, 0.0]))
         p = p_m + error[:3]

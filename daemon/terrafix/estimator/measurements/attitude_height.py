@@ -12,6 +12,7 @@ from terrafix.estimator.state import HEADING, MOUNT_TILT_X, MOUNT_TILT_Y
 from terrafix.messages import Origin
 
 UNKNOWN_RAD = 3.0  # 1-sigma of an unreported heading [tuned]
+TURN_UNSEEN_RAD = 0.3  # 1-sigma of its change up to an unseen frame [tuned]
 # 1-sigma of unreported roll and pitch: a copter in cruise tilts by 10 to 20 degrees, a plane banks as much in a turn
 # ...
 UNKNOWN_ATTITUDE_RAD = np.radians(8.0)  # [tuned]
@@ -55,7 +56,8 @@ class MountedCamera:
         self._tilt_reported = attitude.pitch_rad is not None and attitude.roll_rad is not None
         if self._tilt_reported:
             tilt = float(np.hypot(np.radians(max(origin.attitude_sigma_deg, 0.3)), attitude.righted_rad))
-        yaw_rad, yaw_sigma = attitude.yaw_rad, np.radians(max(origin.yaw_sigma_deg, 1.0))
+        yaw_rad = attitude.yaw_rad
+        yaw_sigma = float(np.hypot(np.radians(max(origin.yaw_sigma_deg, 1.0)), attitude.turned_rad))
         if yaw_rad is None:
             yaw_rad, yaw_sigma = self.yaw_rad(r_w_c), UNKNOWN_RAD * 10
         height = DEFAULT_AGL_SIGMA_M * 20 if attitude.agl_m is None else max(origin.agl_sigma_m, 0.5)

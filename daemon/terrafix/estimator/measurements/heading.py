@@ -22,9 +22,8 @@ def heading_innovation(
     assert state.last is not None
     yaw_rad = state.camera.yaw_rad(state.graph.state(parent).pose.rotation().matrix() @ r_kf_c)
     cov = tangent_to_world(state.last.cov, before.pose.rotation().matrix())
-    sigma_rad = float(
-        np.sqrt(np.radians(state.origin.yaw_sigma_deg) ** 2 + COMPASS_SWING_RAD**2 + cov[WORLD_YAW, WORLD_YAW])
-    )
+    reported2 = np.radians(state.origin.yaw_sigma_deg) ** 2 + attitude.turned_rad**2
+    sigma_rad = float(np.sqrt(reported2 + COMPASS_SWING_RAD**2 + cov[WORLD_YAW, WORLD_YAW]))
     if attitude.yaw_rad is None:
         return ScalarInnovation(0.0, sigma_rad)
     reported_rad = state.camera.yaw_rad(state.camera.expected(attitude, before.bias))

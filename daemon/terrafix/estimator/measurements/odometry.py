@@ -23,7 +23,7 @@ from terrafix.estimator.measurements.heading import heading_innovation
 from terrafix.estimator.measurements.keyframe_link import KeyframeLink, by_link, refused
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
-from terrafix.estimator.state import HEADING, HEIGHT, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
+from terrafix.estimator.state import HEADING, HEIGHT, HORIZONTAL, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import CovarianceMode, Odometry, Verdict
 
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
@@ -43,8 +43,9 @@ class KeyframeMotion:
 class Sighting:
     """Odometry of one frame. ``motion``: None without one. ``fused``: the same, if it enters the graph. ``fragment``:
     to which the frame belongs. ``local_step_m`` (2,): since the frame before, in a fragment that was not confirmed yet.
-    ``innovation``: against the motion model; None where that predicts nothing. ``begins_disconnected``: the first frame
-    of a fragment that is fused, while only dead reckoning ties the fragment to the flight."""
+    ``innovation``: against the motion model, without what a manoeuvre explains, and ``motion_innovation`` with it; None
+    where that predicts nothing. ``begins_disconnected``: the first frame of a fragment that is fused, while only dead
+    reckoning ties the fragment to the flight."""
 
     verdict: Verdict
     motion: KeyframeMotion | None
@@ -52,6 +53,7 @@ class Sighting:
     local_step_m: np.ndarray | None = None
     innovation: Innovation | None = None
     begins_disconnected: bool = False
+    motion_innovation: MotionInnovation | None = None
 
     @property
     def fused(self) -> KeyframeMotion | None:
@@ -83,7 +85,7 @@ class OdometryMeasurement:
         moved_m = keyframe.rotation().matrix() @ answer.motion.p_m
         in_fragment_m = state.fragments.displacement_m(parent) + moved_m[:2]
         local_step_m = None if fragment.confirmed else in_fragment_m - fragment.displacement_m
-        innovation, was_confirmed = None, fragment.confirmed
+        motion, innovation, was_confirmed = None, None, fragment.confirmed
         if attitude.stands or state.yaw_gauge is not None:  # nothing predicts the motion
             if self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False):
                 return Sighting(Verdict.STALLED, None, alone)
@@ -95,13 +97,14 @@ class OdometryMeasurement:
             frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=moves)
             if frozen or not motion.passes_gate:
                 verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
+                state.image_jump = None if frozen else (t_s, motion.residual_m[HORIZONTAL])
                 return Sighting(verdict, None, alone, innovation=innovation)
             if not fragment.confirmed:
                 self._weigh_fragment(fragment, frame, answer, before, motion)
         verdict = Verdict.ACCEPTED if fragment.confirmed else Verdict.UNCONFIRMED
         fragment.displacement_m = in_fragment_m
         disconnected = fragment.confirmed and not was_confirmed and not fragment.joined
-        return Sighting(verdict, answer, fragment, local_step_m, innovation, disconnected)
+        return Sighting(verdict, answer, fragment, local_step_m, innovation, disconnected, motion)
 
     def _weigh_fragment(
         self,
@@ -232,4 +235,5 @@ class OdometryMeasurement:
         if frame.attitude.pitch_rad is None or frame.attitude.roll_rad is None:
             return r_w_kf, UNKNOWN_ATTITUDE_RAD
         r_w_k = self._state.camera.expected(frame.attitude, keyframe.bias, r_w_kf)
-        return r_w_k, np.radians(max(self._state.origin.attitude_sigma_deg, 1.0))
+        tilt_rad = np.radians(max(self._state.origin.attitude_sigma_deg, 1.0))
+        return r_w_k, float(np.hypot(tilt_rad, frame.attitude.righted_rad))

@@ -4,7 +4,7 @@ None."""
 from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +38,8 @@ class Attitude:
     armed: bool | None = None
     airspeed_mps: float | None = None
     righted_rad: float = 0.0  # 1-sigma of the tilt beyond the configured one (ahrs_correction.py)
+    turned_rad: float = 0.0  # 1-sigma of the heading beyond the configured one (same)
+    stale_s: float = 0.0  # from the nearest report to the frame, beyond half an interval of the slowest stream
 
     @property
     def stands(self) -> bool:
@@ -45,7 +47,8 @@ class Attitude:
         return self.armed is False and (self.agl_m is None or self.agl_m < STANDS_BELOW_M)
 
 
-_FIELDS = ("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "armed", "airspeed_mps")
+_ANGLES = ("yaw_rad", "pitch_rad", "roll_rad")
+_FIELDS = (*_ANGLES, "agl_m", "armed", "airspeed_mps")
 
 
 class Telemetry:
@@ -85,7 +88,9 @@ class Telemetry:
             if not unsettled:
                 break
         nearest = {name: value for name, (_, value) in best.items()}
-        return Attitude(*(nearest.get(name) for name in _FIELDS))  # type: ignore[arg-type]
+        away_ns = max((best[name][0] for name in _ANGLES if name in best), default=0)
+        stale_s = max(0, away_ns - MAX_ATTITUDE_GAP_NS // 2) * 1e-9
+        return replace(Attitude(*(nearest.get(name) for name in _FIELDS)), stale_s=stale_s)  # type: ignore[arg-type]
 
     def world_acceleration(self, t0_ns: int, t1_ns: int, turned: np.ndarray | None = None) -> WorldAcceleration | None:
         """Acceleration in the world from ``t0_ns`` to ``t1_ns``; None when readings or attitudes do not cover that.

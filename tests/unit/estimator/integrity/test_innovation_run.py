@@ -15,7 +15,7 @@ def make_run(offsets_m: list[tuple[float, float]], spacing_m: float = 20.0, *, c
 
 
 def test_enough_consistent_offsets_over_a_long_span_confirm_the_run() -> None:
-    run = make_run([(100.0, 0.0), (103.0, -4.0), (98.0, 2.0), (101.0, 1.0)])
+    run = make_run([(100.0, 0.0), (103.0, -4.0), (98.0, 2.0), (100.0, 0.0)])
     assert run.is_confirmed(4, 50.0)
     assert not run.is_confirmed(5, 50.0)  # too few
     assert not run.is_confirmed(4, 60.0)  # the span is 60 m, and it must be more
@@ -55,3 +55,14 @@ def test_fixes_agree_if_the_estimate_that_has_moved_since_explains_their_offsets
     run.clear()
     run.re_estimate(now_m.get)
     assert not run.offsets_m
+
+
+def test_an_estimate_that_stands_where_its_claim_says_it_may_move_agrees_with_fixes_that_move() -> None:
+    """A plane that began in the air: nothing has measured its 25 m/s, and each right match is 50 m farther off."""
+    run, ignorant = InnovationRun(), InnovationRun()
+    for i in range(1, 5):
+        at = {"offset_m": np.array([50.0 * i, 0.0]), "p_m": np.zeros(2), "position_only": False, "t_s": 2.0 * i}
+        run.add(**at, cov_m2=np.diag([(26.0 * i) ** 2, (26.0 * i) ** 2]))
+        ignorant.add(**at)  # of an estimate whose claim does not grow
+    assert run.is_confirmed(4, 100.0) and run.drift_mps.tolist() == [25.0, 0.0]
+    assert len(ignorant.offsets_m) == 1 and not ignorant.drift_mps.any()

@@ -221,7 +221,7 @@ def test_without_gyroscopes_the_reported_attitude_is_used() -> None:
 
 
 def test_an_autopilot_without_position_aiding_has_a_larger_tilt_sigma() -> None:
-    monitor = AhrsCorrectionMonitor(simulate(1.0, lambda t: 0.0))
+    monitor = AhrsCorrectionMonitor(Telemetry())
 
     def off_rad(t_s: float, sigma_mps: float) -> float:
         attitude = monitor.attitude_at(round(t_s * S), SIGMA_RAD, YAW_SIGMA_RAD)
