@@ -115,9 +115,10 @@ def status_of(edge: MavlinkEdge, now_ns: int) -> m.LinkStatus:
     return status
 
 
-def test_two_autopilots_are_reported_and_the_first_is_served() -> None:
+def test_two_autopilots_are_reported_and_the_confirmed_one_is_served() -> None:
     wire = MemoryWire()
     edge = edge_on(wire)
+    edge.on_message(m.CameraVehicle(t_ns=0, sysid=7))
     wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)), packed(heartbeat(), mavlink.MAVLink(None, 9, 1)))
     status = status_of(edge, 0)
     assert status.sysid == 7
