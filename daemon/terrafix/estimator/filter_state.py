@@ -28,6 +28,8 @@ from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.state import HEIGHT, LOG_HEIGHT_SCALE, MOTION_SIZE, RADIAL_K1, UP, VELOCITY
 from terrafix.messages import Camera, CovarianceMode, LensEstimate, Odometry, Origin
 
+# Time for which a frame that has left the window is known: the longest that the anchor works on a match.
+LEFT_S = 90.0  # [spec: stuck_after_s of the anchor, processes.py]
 LENS_SURE = 3.0  # sigmas, from which a lens distortion is applied: no lens has exactly none [tuned]
 
 
@@ -61,6 +63,15 @@ class FrameState:
     velocity_mps: np.ndarray
     velocity_cov: np.ndarray
     node: int
+
+
+@dataclass(frozen=True)
+class PastFrame:
+    """A frame as it is, or was when it left the window: time, pose, and its covariance (6, 6) in tangent order."""
+
+    t_s: float
+    pose: gtsam.Pose3
+    cov: np.ndarray
 
 
 @dataclass
@@ -98,6 +109,7 @@ class FilterState:
         self.fragments = Fragments()
         self.fragment = Fragment.joined_at(0.0)  # of the newest frame
         self.keyframes = KeyframeStore()
+        self.left: dict[int, PastFrame] = {}  # frames that have left the window since the graph began
         self.continuity = FrameContinuity()
         self.yaw_gauge: YawGauge | None = None
         self.last: FrameState | None = None  # newest frame
@@ -179,6 +191,9 @@ class FilterState:
     def keep_keyframes(self, leaving: Iterable[int]) -> None:
         """The nodes ``leaving`` are about to leave the window."""
         for node in leaving:
+            past = PastFrame(self.graph.time_of(node), self.graph.state(node).pose, self.covariances.recent_pose(node))
+            self.left = {f: other for f, other in self.left.items() if past.t_s - other.t_s < LEFT_S}
+            self.left[self.frames[node]] = past
             frame_id = self.keyframe_of.get(node)
             if frame_id is not None:
                 self.keyframes.add(frame_id, self._keyframe_at(node))

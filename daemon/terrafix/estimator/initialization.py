@@ -72,6 +72,7 @@ def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior, *, j
     ``joined``: a measurement ties the frame to the flight; False: dead reckoning alone."""
     assert state.newest_odometry is not None
     state.keep_keyframes(state.graph.window)
+    state.left.clear()  # the new graph may lie elsewhere
     state.velocity_cov = prior.velocity_cov
     node = state.graph.start(t_s, prior)
     state.covariances.started(node, prior)

@@ -8,7 +8,7 @@ import numpy as np
 
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.core.pose import tangent_to_world
-from terrafix.estimator.filter_state import FilterState, FrameState
+from terrafix.estimator.filter_state import FilterState, FrameState, PastFrame
 from terrafix.estimator.graph.pose_graph import GraphPrior
 from terrafix.estimator.initialization import ResetReason, reset
 from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT, AlternativePosition
@@ -96,13 +96,13 @@ class MapUpdate:
         if match.verdict is not Verdict.ACCEPTED:
             return _result(match.verdict, f"{match.inliers} inliers" if match.verdict in NOTHING_FOUND else "")
         if node is None:
-            return _result(Verdict.STALE, "frame has left the window")
+            return self._apply_late(match) or _result(Verdict.STALE, "frame has left the window")
         if not determined(match):
             return _result(Verdict.DEGENERATE, "2D-3D matches do not determine the pose")
         measurement = MapPoseMeasurement.of(match, state.terrain, state.radial_k1_estimate)
         if match.search.relocalized:  # by a search over several frames: it outweighs whatever the graph has
             self.hypotheses.other, self.hypotheses.map_consistency = AlternativePosition(), MapConsistency()
-            return self._reset(match, node, measurement, "found")
+            return self._reset(match, self._past(node), measurement, "found")
         if state.yaw_gauge is not None:
             return self._apply_without_heading(match, node, measurement)
         finds = match.position_only and self._is_uncertain(node, measurement)
@@ -133,7 +133,7 @@ class MapUpdate:
         innovation = measurement.position_innovation(frame.pose, frame.cov)
         if not innovation.is_accepted:
             return self._reject(match, node, measurement, innovation)
-        return self._reset(match, node, measurement, "heading found")
+        return self._reset(match, self._past(node), measurement, "heading found")
 
     def _is_uncertain(self, node: int, measurement: MapPoseMeasurement) -> bool:
         """Whether the estimate is too uncertain for a coarse match to continue it."""
@@ -232,18 +232,40 @@ class MapUpdate:
             needed = (MIN_CONSISTENT, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
             if (found or run.is_confirmed(*needed, poses_only=certain)) and _place_mass(match) >= RECOVER_MASS:
                 other.switch(offset, apart)
-                return self._reset(match, node, measurement, "restarted")
+                return self._reset(match, self._past(node), measurement, "restarted")
         detail = f"horizontally {float(np.hypot(*offset)):.0f} m from the estimate"
         return MapResult(FusionVerdict(measurement.name, Verdict.INNOVATION, innovation, detail))
 
-    def _reset(self, match: MapMatch, node: int, measurement: MapPoseMeasurement, how: str) -> MapResult:
-        """A new graph at the map match, and since a match comes late, moved on to the newest frame by what the graph
-        has of the motion since."""
+    def _past(self, node: int) -> PastFrame:
+        graph = self._state.graph
+        return PastFrame(graph.time_of(node), graph.state(node).pose, self._state.covariance(node))
+
+    def _apply_late(self, match: MapMatch) -> MapResult | None:
+        """On a busy computer every match may come after its frame has left the window. One that agrees with the frame
+        as it was then is used where it places the newest frame better than the estimate does. None: it does not."""
+        state, was = self._state, self._state.left.get(match.frame_id)
+        if was is None or match.position_only or not determined(match) or state.yaw_gauge is not None:
+            return None
+        if not state.graph.window:  # the flight is over
+            return None
+        measurement = MapPoseMeasurement.of(match, state.terrain, state.radial_k1_estimate)
+        now = self._past(state.graph.newest)
+        moved_m2, now_m2 = (
+            np.linalg.eigvalsh(tangent_to_world(cov, now.pose.rotation().matrix())[HORIZONTAL, HORIZONTAL])[-1]
+            for cov in (self._moved_cov(measurement.cov, was.pose.between(now.pose), now.t_s - was.t_s), now.cov)
+        )
+        if moved_m2 > now_m2 or not measurement.position_innovation(was.pose, was.cov).is_accepted:
+            return None
+        return replace(self._reset(match, was, measurement, "late"), fixed=None)  # the smoother has forgotten the frame
+
+    def _reset(self, match: MapMatch, was: PastFrame, measurement: MapPoseMeasurement, how: str) -> MapResult:
+        """A new graph at the map match of the frame ``was``, and since a match comes late, moved on to the newest frame
+        by what the graph has of the motion since."""
         state = self._state
-        was, now = state.graph.state(node), state.graph.state(state.graph.newest)
-        fixed_s, now_s = state.graph.time_of(node), state.graph.time_of(state.graph.newest)
-        position = measurement.position_innovation(was.pose, state.covariance(node))
-        fixed = levelled(measurement, was.pose, state.covariance(node))
+        now = state.graph.state(state.graph.newest)
+        fixed_s, now_s = was.t_s, state.graph.time_of(state.graph.newest)
+        position = measurement.position_innovation(was.pose, was.cov)
+        fixed = levelled(measurement, was.pose, was.cov)
         offset = position.residual
         start_off = self._start_off(position)
         onward = was.pose.between(now.pose)

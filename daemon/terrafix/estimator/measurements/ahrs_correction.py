@@ -17,7 +17,7 @@ from terrafix.core.geodesy import euler_from_rot, rot_w_b
 from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.measurements.attitude_height import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
-from terrafix.estimator.measurements.telemetry_buffer import MAX_GAP_NS, Attitude, Telemetry
+from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.models.motion_model import TILT_CORRELATION_S, WorldAcceleration
 
 # Of a rotation without the gyroscopes, what is no wrong correction: gyroscope bias hours after calibration (InvenSense
@@ -69,9 +69,10 @@ class AhrsCorrectionMonitor:
         out = np.array([*tilt_out, _unexplained_share(float(yaw), 2.0 * yaw_sigma_rad) * self._unmeasured[2]])
         self._removed.append((t_ns, out))
         attitude = self._telemetry.at(t_ns)
-        stale = attitude.stale_s * 1e9 / MAX_GAP_NS  # up to a report that is too far to be used
-        righted_rad = math.hypot(self._extra_tilt_sigma_rad(t_ns * 1e-9, tilt_sigma_rad), stale * UNKNOWN_ATTITUDE_RAD)
-        attitude = replace(attitude, righted_rad=righted_rad, turned_rad=stale * TURN_UNSEEN_RAD)
+        righted_rad = math.hypot(
+            self._extra_tilt_sigma_rad(t_ns * 1e-9, tilt_sigma_rad), attitude.stale * UNKNOWN_ATTITUDE_RAD
+        )
+        attitude = replace(attitude, righted_rad=righted_rad, turned_rad=attitude.stale * TURN_UNSEEN_RAD)
         if not out.any() or attitude.yaw_rad is None or attitude.pitch_rad is None or attitude.roll_rad is None:
             return attitude
         r_w_b = exp_so3(-out) @ rot_w_b(attitude.yaw_rad, attitude.pitch_rad, attitude.roll_rad)

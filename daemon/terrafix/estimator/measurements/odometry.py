@@ -236,4 +236,4 @@ class OdometryMeasurement:
             return r_w_kf, UNKNOWN_ATTITUDE_RAD
         r_w_k = self._state.camera.expected(frame.attitude, keyframe.bias, r_w_kf)
         tilt_rad = np.radians(max(self._state.origin.attitude_sigma_deg, 1.0))
-        return r_w_k, float(np.hypot(tilt_rad, frame.attitude.righted_rad))
+        return r_w_k, float(np.hypot(tilt_rad, frame.attitude.stale * UNKNOWN_ATTITUDE_RAD))

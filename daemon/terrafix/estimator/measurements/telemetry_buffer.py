@@ -42,6 +42,11 @@ class Attitude:
     stale_s: float = 0.0  # from the nearest report to the frame, beyond half an interval of the slowest stream
 
     @property
+    def stale(self) -> float:
+        """0 to 1: of the way from an attitude of the frame's time to one that is too far from it to be used."""
+        return self.stale_s * 1e9 / MAX_GAP_NS
+
+    @property
     def stands(self) -> bool:
         """On the ground, disarmed. With a reported height in the air it is not."""
         return self.armed is False and (self.agl_m is None or self.agl_m < STANDS_BELOW_M)
