@@ -272,6 +272,7 @@ def test_the_simulated_autopilot_navigates_on_the_gps_input_of_the_link(tmp_path
     assert report.interval_median_ms == pytest.approx(100.0, abs=20.0)
     assert report.gps_error_median_m is not None
     assert report.gps_error_median_m < 1.0
+    assert report.fixes_beyond_3_sigma == 0
     assert report.position_error_median_m is not None
     assert report.position_error_median_m < 1.0
     assert report.message_intervals_set == len(STREAMS_HZ)

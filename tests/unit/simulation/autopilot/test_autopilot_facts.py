@@ -6,12 +6,15 @@ firmware's own error depends on the noise of its sensors."""
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from autopilot_rig import GOOD, HEIGHT_M, LAT, LON, Gps, Rig, at_5_hz, changed, real_fix
+from autopilot_rig import FRAME, GOOD, HEIGHT_M, LAT, LON, Gps, Rig, at_5_hz, changed, real_fix
 from terrafix.link.integrity.output_predictor import offset
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, Kind
+from terrafix_tools.sim.autopilot.report import PeerMonitor
+from terrafix_tools.sim.interfaces import State
 
 ABSOLUTE, RELATIVE, VELOCITY, GLITCH, CONSTANT = 16, 8, 2, 32768, 128  # EKF_STATUS_REPORT.flags
 BOTH = pytest.mark.parametrize("kind", list(Kind))
@@ -540,3 +543,22 @@ def test_fact_returning_gps_overrides_an_external_position() -> None:
     assert rig.error_m() < 1.8
     rig.fly(3.0, GOOD)
     assert rig.error_m() < 0.5
+
+
+def test_the_report_counts_fixes_that_are_farther_off_than_three_times_their_accuracy() -> None:
+    rig = Rig(Kind.COPTER)
+    monitor = PeerMonitor(rig.autopilot, FRAME)
+    still = {name: np.zeros(3) for name in ("velocity_enu_mps", "rates_b_radps", "force_b_mps2")}
+    level = dict.fromkeys(("yaw_rad", "pitch_rad", "roll_rad", "agl_m", "airspeed_mps"), 0.0)
+
+    def fly(seconds: float, gps: Gps) -> None:
+        for _ in range(round(seconds / 0.02)):
+            rig.fly(0.02, gps)
+            monitor.observe(rig.t_s, State(t_s=rig.t_s, p_b_in_w_m=rig.truth(rig.t_s), **still, **level))
+
+    fly(2.0, GOOD)
+    assert monitor.report().fixes_beyond_3_sigma == 0
+    fly(1.0, changed(north_m=4.0, hacc=1.5))
+    assert monitor.report().fixes_beyond_3_sigma == 0
+    fly(1.0, changed(north_m=5.0, hacc=1.5))
+    assert monitor.report().fixes_beyond_3_sigma == 5

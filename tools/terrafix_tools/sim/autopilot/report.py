@@ -40,6 +40,7 @@ class PeerReport:
     gps_error_median_m: float | None = None  # position in the message, at its time of validity
     gps_error_p95_m: float | None = None
     gps_error_max_m: float | None = None
+    fixes_beyond_3_sigma: int = 0  # 3D fixes that were farther off than 3 times the accuracy in the message
     position_error_median_m: float | None = None  # of the navigation solution
     position_error_p95_m: float | None = None
     position_error_max_m: float | None = None
@@ -141,6 +142,7 @@ class PeerMonitor:
             gps_error_median_m=quantile(gps_errors, 0.5),
             gps_error_p95_m=quantile(gps_errors, 0.95),
             gps_error_max_m=max(gps_errors, default=None),
+            fixes_beyond_3_sigma=sum(fix.error_m > 3.0 * (fix.horizontal_m or 0.0) for fix in self.fixes),
             position_error_median_m=quantile(errors, 0.5),
             position_error_p95_m=quantile(errors, 0.95),
             position_error_max_m=max(errors, default=None),
