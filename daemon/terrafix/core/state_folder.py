@@ -14,3 +14,12 @@ def state_folder() -> Path:
     if os.access(SERVICE, os.W_OK | os.X_OK):
         return SERVICE
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "terrafix"
+
+
+def flush_to_disk(path: Path) -> None:
+    """A file, or the names in a folder: on the disk when this returns. Raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -267,9 +267,7 @@ class MavlinkEdge:
                 self._streams.restart()
             self._heights_of = heights_of
             self._autopilot.telemetry.on_reboot()
-        if (
-            not contested or kind == "HEARTBEAT"
-        ):  # nothing else of a vehicle without this camera may reach the estimator
+        if not contested or kind == "HEARTBEAT":  # a vehicle without this camera must not reach the estimator
             yield from self._autopilot.on_message(message, now_ns, self._own_receiver())
         if kind == "HEARTBEAT":
             self._checkpoint.on_heartbeat(self._autopilot.telemetry.armed_autopilot, self._served.address)

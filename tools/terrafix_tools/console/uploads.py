@@ -19,6 +19,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import ClientDisconnect, Request
 
 from terrafix.core.errors import SourceError
+from terrafix.core.state_folder import flush_to_disk
 from terrafix.messages import VehicleState
 from terrafix.vision.sources.exif import PhotoInfo, read_info
 from terrafix.vision.sources.images import stated_size
@@ -222,7 +223,7 @@ def store_batch(database: Database, flight_id: str, folder: Path, parts: list[Pa
     infos = [read_info(part.path) for part in images]
     try:
         for part in images:
-            _sync(part.path)
+            flush_to_disk(part.path)
         (folder / IMAGES).mkdir(exist_ok=True)
         with database.write() as db:
             row = flights.row_of(db, flight_id)
@@ -251,7 +252,7 @@ def store_batch(database: Database, flight_id: str, folder: Path, parts: list[Pa
                 state = _completed(state, new, t_ns)
                 text = None if state is None else msgspec.json.encode(state).decode()
                 batch.append(StoredImage(frame_id, part.name, stored, part.bytes, part.sha256, t_ns, text))
-            _sync(folder / IMAGES)
+            flush_to_disk(folder / IMAGES)
             return flights.add_images(db, flight_id, batch, last_number)
     except OSError as error:
         raise Refusal(FULL, f"the upload cannot be stored ({error.strerror})") from None
@@ -319,14 +320,6 @@ def _completed(state: VehicleState | None, new: NewFlight, t_ns: int) -> Vehicle
         agl_m=state.agl_m if state.agl_m is not None else agl_m,
         yaw_rad=state.yaw_rad if state.yaw_rad is not None else yaw_rad,
     )
-
-
-def _sync(path: Path) -> None:
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 class Slots:

@@ -1,12 +1,12 @@
 """What the autopilot navigated by before it was switched to our position: saved on disk until it is restored."""
 
-import os
 from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 
 from terrafix.core import logs
+from terrafix.core.state_folder import flush_to_disk
 from terrafix.runtime.checkpoint import CheckpointFile
 
 FILE_NAME = "position-source.json"
@@ -39,7 +39,7 @@ class PreviousSourceFile:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._file.save(previous)
             for path in (self._path, self._path.parent):
-                _flush_to_disk(path)
+                flush_to_disk(path)
         except OSError as error:
             todo = "after a crash, run terrafix preflight --restore"
             logs.get().warning("position source not saved", file=str(self._path), reason=str(error), todo=todo)
@@ -47,12 +47,3 @@ class PreviousSourceFile:
     def remove(self) -> None:
         with suppress(OSError):
             self._file.remove()
-
-
-def _flush_to_disk(path: Path) -> None:
-    """Raises OSError."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

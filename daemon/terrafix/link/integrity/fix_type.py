@@ -32,9 +32,7 @@ SPIKE_HOLD_NS = 2_000_000_000  # ns of no fix before the larger accuracy is repo
 # AP_NavEKF3_VehicleStatus.cpp, calcGpsGoodToAlign, at EK3_CHECK_SCALE 100). The peak hold has forgotten all by then.
 ALIGNMENT_GAP_NS = 5_000_000_000  # ns [spec: ArduPilot calcGpsGoodToAlign]
 FIRST_HORIZONTAL_M = 6.5  # m; 1.3 times 5 m [spec: ArduPilot calcGpsGoodToAlign]
-FIRST_SPEED_SIGMA_MPS = (
-    1.29  # m/s; 1.3 times 1 m/s, less the rounding of both sides [spec: ArduPilot calcGpsGoodToAlign]
-)
+FIRST_SPEED_SIGMA_MPS = 1.29  # m/s; 1.3 times 1 m/s, less rounding [spec: ArduPilot calcGpsGoodToAlign]
 # ns for which a better first accuracy is awaited: the recommended EK3_GPS_CHECK ignores it, and the autopilot, which
 # needs 0.7 s, must use the position within 2 s. [measured: docs/autopilot-facts.md]
 FIRST_WAIT_NS = 1_000_000_000
