@@ -27,7 +27,7 @@ from terrafix_tools.sim.sitl.observer import (
 )
 from terrafix_tools.sim.sitl.report import (
     Figures,
-    Kill,
+    Interruption,
     Times,
     figures,
     verdicts,
@@ -145,14 +145,14 @@ def test_unhealthy_reports_without_a_fix_count_towards_the_share_of_healthy_ones
 
 
 def test_a_restart_is_left_out_of_the_share_and_of_the_gap_until_the_fix_is_back() -> None:
-    killed = Kill(100 * S, 118 * S, 120 * S)
+    killed = Interruption(100 * S, 118 * S, 120 * S, 121 * S)
     log = without_fix(good_flight(), 100, 120, unhealthy=True)
-    flown = figures(log, replace(TIMES, kills=(killed,)), landing())
+    flown = figures(log, replace(TIMES, interruptions=(killed,)), landing())
     assert flown.gps_input_longest_gap_s == 19.0 and flown.gps_input_fix_share < 0.95
     assert (flown.undisturbed_longest_gap_s, flown.undisturbed_fix_share, flown.undisturbed_healthy_share) == (0, 1, 1)
-    assert failing(log, replace(TIMES, kills=(killed,))) == set()
+    assert failing(log, replace(TIMES, interruptions=(killed,))) == set()
     after = without_fix(log, 120, 130)
-    assert "never 7 s without a 3D fix" in failing(after, replace(TIMES, kills=(killed,)))
+    assert "never 7 s without a 3D fix" in failing(after, replace(TIMES, interruptions=(killed,)))
 
 
 def test_the_error_of_the_autopilots_own_position_is_judged() -> None:
@@ -185,13 +185,15 @@ def test_every_restart_is_timed_and_the_slowest_decides() -> None:
             for t_ns, fix in gone:
                 log.fix_types[1][log.fix_types[1].index((t_ns, fix))] = (t_ns, 1)
             recovered_ns = None if after_s is None else round((at_s + 5.0 + after_s) * S)
-            kills.append(Kill(at_s * S, (at_s + 5) * S, recovered_ns))
-        flown = figures(log, replace(TIMES, kills=tuple(kills)), landing())
-        return flown, verdicts(flown, 5000.0)["3D fix again within 2 s of each restart"]
+            kills.append(Interruption(at_s * S, (at_s + 5) * S, recovered_ns))
+        flown = figures(log, replace(TIMES, interruptions=tuple(kills)), landing())
+        return flown, verdicts(flown, 5000.0)["3D fix again within 2 s of each interruption"]
 
     flown, quick = flown_with(1.0, 1.5)
     assert flown.back_s == pytest.approx([1.0, 1.5]) and flown.seen_lost_s == pytest.approx([4.0, 4.0]) and quick
     assert flown_with(1.0, 2.5, 1.0)[1] is False
+    late = Interruption(100 * S, 105 * S, 106 * S, 109 * S)
+    assert "used by the EKF within 2 s of this fix" in failing(good_flight(), replace(TIMES, interruptions=(late,)))
     never, quick = flown_with(1.0, None)
     assert never.back_s == [1.0, None] and not quick
 

@@ -24,7 +24,9 @@ class Station:
     """Ground station stub; rejects arming ``refusals`` times, and has the parameters in ``known``."""
 
     def __init__(self, refusals: int = 0, known: tuple[str, ...] = ("SIM_GPS_DISABLE",)) -> None:
-        self.refusals, self.known, self.done = refusals, known, []
+        self.refusals, self.known = refusals, known
+        self.done: list[Any] = []
+        self.values = {"GPS_AUTO_SWITCH": 4, "GPS_PRIMARY": 0}
 
     def upload(self, mission: Any) -> None:
         self.done.append("upload")
@@ -38,10 +40,23 @@ class Station:
     def start_mission(self) -> None:
         self.done.append("start")
 
-    def set_parameter(self, name: str, value: int) -> None:
+    def set_parameter(self, name: str, value: float) -> None:
         if name not in self.known:
             raise LinkError(f"the autopilot did not set {name}")
         self.done.append((name, value))
+
+    def parameter(self, name: str) -> int:
+        return self.values[name]
+
+
+class Camera:
+    paused = False
+
+    def pause(self) -> None:
+        self.paused = True
+
+    def resume(self) -> None:
+        self.paused = False
 
 
 class Daemon:
@@ -74,7 +89,8 @@ def made(log: FlightLog, station: Station | None = None) -> tuple[Stages, Statio
     observer: Any = SimpleNamespace(log=log)
     any_station: Any = station
     any_daemon: Any = daemon
-    return Stages(firmware, any_station, observer, any_daemon, scene, Console(quiet=True)), station, daemon
+    camera: Any = Camera()
+    return Stages(firmware, any_station, observer, any_daemon, camera, scene, Console(quiet=True)), station, daemon
 
 
 def flying(height_m: float = 100.0, fix_since_s: float = 15.0) -> FlightLog:
@@ -140,7 +156,7 @@ def test_a_receiver_that_stays_on_aborts_the_flight() -> None:
 
 
 def test_each_kill_waits_for_the_recovery_from_the_previous(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sitl_stages, "KILL_AFTER_S", 0.01)
+    monkeypatch.setattr(sitl_stages, "CALM_S", 0.01)
     monkeypatch.setattr(sitl_stages, "DOWN_S", 0.01)
     monkeypatch.setattr(sitl_stages, "BACK_S", 0.05)
     log = flying()
@@ -149,19 +165,54 @@ def test_each_kill_waits_for_the_recovery_from_the_previous(monkeypatch: pytest.
 
     def back() -> None:
         start()
-        log.fix_types[1].append((time.monotonic_ns() + 30_000_000, 3))
+        now_ns = time.monotonic_ns()
+        log.fix_types[1].append((now_ns + 30_000_000, 3))
+        log.ekf_flags += [(now_ns + 20_000_000, mavlink.EKF_POS_HORIZ_ABS), (now_ns + 35_000_000, mavlink.EKF_ATTITUDE)]
+        log.ekf_flags.append((now_ns + 50_000_000, mavlink.EKF_POS_HORIZ_ABS))
 
     daemon.start = back  # type: ignore[method-assign]
     stages.kill_terrafix()
     stages.kill_terrafix()
-    first, second = stages.times.kills
+    first, second = stages.times.interruptions
     assert first.recovered_ns is not None and second.recovered_ns is not None
-    assert first.killed_ns < first.restarted_ns < first.recovered_ns <= second.recovered_ns
+    assert first.used_ns is not None and first.used_ns - first.recovered_ns == 20_000_000
+    assert first.began_ns < first.ended_ns < first.recovered_ns <= second.recovered_ns
     daemon.start = start  # type: ignore[method-assign]
     time.sleep(0.05)
     with pytest.raises(FlightAborted, match="no 3D fix after the restart within"):
         stages.kill_terrafix()
-    assert [kill.recovered_ns is None for kill in stages.times.kills] == [False, False, True]
+    assert [gap.recovered_ns is None for gap in stages.times.interruptions] == [False, False, True]
+
+
+def test_the_camera_is_off_for_the_stated_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sitl_stages, "CALM_S", 0.01)
+    monkeypatch.setattr(sitl_stages, "BACK_S", 0.05)
+    stages, _, _ = made(flying())
+    with pytest.raises(FlightAborted, match="no 3D fix after the camera's return within"):
+        stages.cover_camera(0.2)
+    (gap,) = stages.times.interruptions
+    assert 0.2e9 <= gap.ended_ns - gap.began_ns < 1e9 and gap.recovered_ns is None
+
+
+@pytest.mark.parametrize("restored", [True, False])
+def test_a_spoof_ends_with_the_position_source_from_before_it(restored: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SPOOFED_S", "DOWN_S", "SWITCH_S"):
+        monkeypatch.setattr(sitl_stages, name, 0.05)
+    station = Station(known=("SIM_GPS_GLITCH_X",))  # the name up to 4.6
+    stages, _, daemon = made(flying(), station)
+
+    def shifted(name: str, value: float) -> None:
+        Station.set_parameter(station, name, value)
+        station.values["GPS_PRIMARY"] = 1
+
+    station.set_parameter = shifted  # type: ignore[method-assign]
+    daemon.start = lambda: station.values.update(GPS_PRIMARY=0 if restored else 1)  # type: ignore[method-assign]
+    if restored:
+        stages.spoof_and_kill()
+        assert station.done == [("SIM_GPS_GLITCH_X", 0.001), ("SIM_GPS_GLITCH_X", 0.0)]
+    else:
+        with pytest.raises(FlightAborted, match="no restored position source"):
+            stages.spoof_and_kill()
 
 
 def test_the_vehicle_has_landed_when_it_disarms() -> None:

@@ -45,7 +45,10 @@ def ardupilot(
     parameters: Annotated[
         list[Path] | None, typer.Option(help="Parameter file of the vehicle; default: second-gps.param.")
     ] = None,
-    kills: Annotated[int, typer.Option(min=0, help="Number of kills and restarts of Terrafix without GNSS.")] = 0,
+    disturb: Annotated[
+        list[str] | None,
+        typer.Option(help="In flight, as often as given: kill (all of Terrafix), camera:SECONDS (no image), spoof."),
+    ] = None,
     gnss_start: Annotated[
         bool,
         typer.Option("--gnss-start", help="No configured start: take the autopilot's GNSS position on the ground."),
@@ -53,6 +56,7 @@ def ardupilot(
 ) -> None:
     """Fly a mission with ArduPilot SITL on Terrafix' GPS_INPUT, in real time."""
     try:
+        from terrafix_tools.sim.sitl.fly import Disturbance
         from terrafix_tools.sim.sitl.fly import fly as fly_firmware
     except ModuleNotFoundError as error:
         if error.name != "mavsdk":
@@ -67,7 +71,7 @@ def ardupilot(
         length_m=length * 1e3,
         port=port,
         parameters=parameters,
-        kills=kills,
+        disturbances=[Disturbance.parsed(text) for text in disturb or []],
         gnss_start=gnss_start,
     )
     raise typer.Exit(code)

@@ -35,7 +35,7 @@ class SimulatedCamera:
         self._stream, self._ground, self._frame, self._truth_at = stream, ground, frame, truth_at
         self._renderer = Renderer(ground, CAMERA, seed=seed)
         self._r_b_c = Mount(CAMERA.mount_yaw_deg, CAMERA.mount_pitch_deg, CAMERA.mount_roll_deg).r_b_c()
-        self._stopping = threading.Event()
+        self._stopping, self._paused = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="sitl-camera", daemon=True)
         self.frames = 0
 
@@ -45,6 +45,13 @@ class SimulatedCamera:
         ground_m = float(self._ground.height_amsl_m(np.array([[e_m]]), np.array([[n_m]]))[0, 0])
         r_w_b = rot_w_b(truth.yaw_rad, truth.pitch_rad, truth.roll_rad)
         return np.array([e_m, n_m, max(truth.amsl_m, ground_m + MIN_CAMERA_HEIGHT_M)]), r_w_b @ self._r_b_c
+
+    def pause(self) -> None:
+        """No image is sent until ``resume``."""
+        self._paused.set()
+
+    def resume(self) -> None:
+        self._paused.clear()
 
     def __enter__(self) -> "SimulatedCamera":
         self._thread.start()
@@ -62,7 +69,7 @@ class SimulatedCamera:
             truth = self._truth_at(due_ns)
             while truth is None and time.monotonic_ns() < due_ns + period_ns and not self._stopping.wait(RETRY_S):
                 truth = self._truth_at(due_ns)
-            if truth is not None:
+            if truth is not None and not self._paused.is_set():
                 self._stream.push(self._renderer.frame(*self.pose(truth), self.frames), due_ns)
                 self.frames += 1
             due_ns += period_ns * max(1, (time.monotonic_ns() - due_ns) // period_ns)

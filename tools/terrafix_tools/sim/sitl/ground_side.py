@@ -39,13 +39,21 @@ class Ground:
     def arm(self) -> None:
         self._try("arm", self._action.arm)
 
-    def set_parameter(self, name: str, value: int) -> None:
-        self._try(f"set {name}", lambda: self._param.set_param_int(name, value))
+    def set_parameter(self, name: str, value: float) -> None:
+        """As the parameter's type requires: an integer for an ``int``."""
+        if isinstance(value, int):
+            self._try(f"set {name}", lambda: self._param.set_param_int(name, value))
+        else:
+            self._try(f"set {name}", lambda: self._param.set_param_float(name, value))
+
+    def parameter(self, name: str) -> int:
+        """Value of an integer parameter."""
+        return int(self._try(f"report {name}", lambda: self._param.get_param_int(name)))
 
     @staticmethod
-    def _try(what: str, call: Any) -> None:
+    def _try(what: str, call: Any) -> Any:
         try:
-            call()
+            return call()
         except MavsdkError as error:
             raise LinkError(f"the autopilot did not {what}: {error}") from None
 

@@ -18,10 +18,12 @@ from terrafix.vision.sources.description import CameraTable, Description, MountT
 from terrafix_tools import child_process
 from terrafix_tools.sim.flights.description import write_toml
 from terrafix_tools.sim.flights.folder import AGL_SIGMA_M, ATTITUDE_SIGMA_DEG, CAMERA, YAW_SIGMA_DEG
+from terrafix_tools.sim.sitl.camera import SimulatedCamera
 from terrafix_tools.sim.sitl.firmware import Firmware
+from terrafix_tools.sim.sitl.firmware_log import POSITION_SOURCE
 from terrafix_tools.sim.sitl.ground_side import Ground
 from terrafix_tools.sim.sitl.observer import Observer
-from terrafix_tools.sim.sitl.report import FIX_3D, Kill, Times
+from terrafix_tools.sim.sitl.report import FIX_3D, Interruption, Times
 from terrafix_tools.sim.sitl.scene import Scene
 
 GPS_ID = 1  # Terrafix is the second GPS
@@ -37,9 +39,13 @@ LOSS_S = 10.0
 POLL_S = 0.2
 GNSS_OFF = (("SIM_GPS_DISABLE", 1), ("SIM_GPS1_ENABLE", 0))  # parameters of ArduPilot up to 4.6, and of later versions
 NO_FIX = 1  # GPS_INPUT is received, without a fix
-KILL_AFTER_S = 25.0  # time without GNSS before a kill, and between kills
+CALM_S = 25.0  # time without GNSS before an interruption, and between two
 DOWN_S = 5.0  # downtime; the firmware notices after 4 s
-BACK_S = 120.0  # time-out from the restart to a 3D fix
+BACK_S = 120.0  # time-out from the end of an interruption to a 3D fix that the EKF uses
+GLITCH = ("SIM_GPS1_GLTCH_X", "SIM_GPS_GLITCH_X")  # latitude added to the receiver's, of 4.7 and later, and before
+SPOOF_DEG = 0.001  # 111 m
+SWITCH_S = 60.0  # time-out until the autopilot has been switched to GPS_INPUT, and back
+SPOOFED_S = 5.0  # from the switch to the kill
 STOP_S = 45.0  # time of systemd for an ordered stop (TimeoutStopSec)
 
 
@@ -52,16 +58,20 @@ class Daemon:
     with this process.
     """
 
-    def __init__(self, out: Path, scene: Scene, source: str, link: str, *, start_configured: bool = True) -> None:
-        """``start_configured``: the camera description contains the start. Raises OutputError."""
+    def __init__(
+        self, out: Path, scene: Scene, source: str, link: str, *, start_configured: bool = True, gnss: str = "advise"
+    ) -> None:
+        """``start_configured``: the camera description contains the start. ``gnss``: link.gnss. Raises OutputError."""
         self._process: subprocess.Popen[bytes] | None = None
         self._log = out / "terrafix.log"
+        self._environment = os.environ | {"STATE_DIRECTORY": str(out / "state")}
         camera, config = out / "camera.toml", out / "terrafix.toml"
         home = scene.home
         start = StartTable(lat_deg=home.lat_deg, lon_deg=home.lon_deg, ground_amsl_m=round(home.amsl_m, 1))
         write_toml(camera, _description(start if start_configured else None), "The camera of the simulated vehicle.")
         try:
-            config.write_text(f'[source]\ncamera = "{camera}"\n[link]\ngps_id = {GPS_ID}\n', encoding="utf-8")
+            link_lines = f'[link]\ngps_id = {GPS_ID}\ngnss = "{gnss}"\n'
+            config.write_text(f'[source]\ncamera = "{camera}"\n{link_lines}', encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
         self._command = [sys.executable, "-m", "terrafix_tools.sim.sitl.child_process", str(os.getpid())]
@@ -72,7 +82,7 @@ class Daemon:
     def start(self) -> None:
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
-                self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+                self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, env=self._environment
             )
 
     def kill(self) -> None:
@@ -101,9 +111,16 @@ class Stages:
     """One method per stage, to be called in this order. Each raises FlightAborted when the stage does not complete."""
 
     def __init__(
-        self, firmware: Firmware, station: Ground, observer: Observer, daemon: Daemon, scene: Scene, console: Console
+        self,
+        firmware: Firmware,
+        station: Ground,
+        observer: Observer,
+        daemon: Daemon,
+        camera: SimulatedCamera,
+        scene: Scene,
+        console: Console,
     ) -> None:
-        self._firmware, self._station, self._observer = firmware, station, observer
+        self._firmware, self._station, self._observer, self._camera = firmware, station, observer, camera
         self._daemon, self._scene, self._console = daemon, scene, console
         self.times = Times()
 
@@ -147,22 +164,72 @@ class Stages:
 
     def kill_terrafix(self) -> None:
         """Kills all of Terrafix and restarts it, as systemd would."""
-        self._pause(KILL_AFTER_S)
+        self._pause(CALM_S)
+        self._interrupt("Terrafix killed", "restart", DOWN_S, self._daemon.kill, self._daemon.start)
+
+    def cover_camera(self, duration_s: float) -> None:
+        """The camera sends nothing for ``duration_s``."""
+        self._pause(CALM_S)
+        self._interrupt("camera off", "camera's return", duration_s, self._camera.pause, self._camera.resume)
+
+    def spoof_and_kill(self) -> None:
+        """Shifts the receiver until the autopilot has been switched to GPS_INPUT, then kills Terrafix, ends the shift
+        and restarts it: the switch must be undone.
+        """
+        self._wait(f"{SAFE_M:.0f} m above home and 3D fix of Terrafix", TAKE_OVER_S, self._ready_for_gnss_loss)
+        before = self._position_source()
+        self._set_first_known(GLITCH, SPOOF_DEG)
+        self._print("receiver spoofed")
+        self._wait("switch to GPS_INPUT", SWITCH_S, lambda: self._position_source() != before)
+        self._print(f"switched: {self._position_source()}")
+        self._pause(SPOOFED_S)
         self._daemon.kill()
-        killed_ns = time.monotonic_ns()
         self._pause(DOWN_S)
+        self._set_first_known(GLITCH, 0.0)
         self._daemon.start()
-        kill, before = Kill(killed_ns, time.monotonic_ns()), self.times.kills
-        self.times = replace(self.times, kills=(*before, kill))
-        self._print("Terrafix killed and restarted")
+        self._wait("restored position source", SWITCH_S, lambda: self._position_source() == before)
+        self._print(f"restored: {self._position_source()}")
+
+    def _interrupt(
+        self, began: str, end: str, duration_s: float, begin: Callable[[], None], undo: Callable[[], None]
+    ) -> None:
+        """Interrupts for ``duration_s``, then waits for a 3D fix that the EKF uses."""
+        begin()
+        began_ns = time.monotonic_ns()
+        self._print(began)
+        self._pause(duration_s)
+        undo()
+        gap, before = Interruption(began_ns, time.monotonic_ns()), self.times.interruptions
+        self.times = replace(self.times, interruptions=(*before, gap))
+        fixes, flags = self._observer.log.fix_types[GPS_ID], self._observer.log.ekf_flags
 
         def recovered_ns() -> int | None:
-            reports = self._observer.log.fix_types[GPS_ID]
-            return next((t_ns for t_ns, fix in reports if t_ns > kill.restarted_ns and fix >= FIX_3D), None)
+            return next((t_ns for t_ns, fix in fixes if t_ns > gap.ended_ns and fix >= FIX_3D), None)
 
-        self._wait("3D fix after the restart", BACK_S, lambda: recovered_ns() is not None)
-        self.times = replace(self.times, kills=(*before, replace(kill, recovered_ns=recovered_ns())))
-        self._print(f"3D fix again {((recovered_ns() or 0) - kill.restarted_ns) / 1e9:.2f} s after the restart")
+        def used_ns() -> int | None:
+            first_ns = recovered_ns() or gap.ended_ns
+            return next((t_ns for t_ns, now in flags if t_ns >= first_ns and now & mavlink.EKF_POS_HORIZ_ABS), None)
+
+        self._wait(f"3D fix after the {end}", BACK_S, lambda: recovered_ns() is not None)
+        self.times = replace(self.times, interruptions=(*before, replace(gap, recovered_ns=recovered_ns())))
+        back_s = ((recovered_ns() or 0) - gap.ended_ns) / 1e9
+        self._wait(f"position of the EKF after the {end}", BACK_S, lambda: used_ns() is not None)
+        whole = replace(gap, recovered_ns=recovered_ns(), used_ns=used_ns())
+        self.times = replace(self.times, interruptions=(*before, whole))
+        self._print(
+            f"3D fix {back_s:.2f} s after the {end}, used {((used_ns() or 0) - gap.ended_ns) / 1e9:.2f} s after it"
+        )
+
+    def _position_source(self) -> dict[str, int]:
+        return {name: self._station.parameter(name) for name in POSITION_SOURCE}
+
+    def _set_first_known(self, names: tuple[str, ...], value: float) -> None:
+        """Sets the parameter that the firmware has, of ``names`` that it had in its versions. Raises FlightAborted."""
+        for name in names:
+            with contextlib.suppress(LinkError):
+                self._station.set_parameter(name, value)
+                return
+        raise FlightAborted(f"the firmware has none of {', '.join(names)}")
 
     def land(self, limit_s: float) -> None:
         """Waits for the rest of the mission; the vehicle disarms itself after landing."""
