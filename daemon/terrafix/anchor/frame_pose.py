@@ -26,7 +26,7 @@ UNKNOWN_HEADING_RAD = 1.5  # 1-sigma above which the heading counts as unknown [
 @dataclass(frozen=True)
 class Observation:
     """One frame correlated with a map layer. ``new``: share of new ground, 0 to 1; ``weight``: that share, at least
-    ``MIN_OBSERVATION_WEIGHT``."""
+    ``MIN_OBSERVATION_WEIGHT``; ``footprint_m``: side of a square of the ground that the correlated frame shows."""
 
     image: Image
     view: View
@@ -34,6 +34,7 @@ class Observation:
     correlation: CorrelationResult
     new: float
     weight: float
+    footprint_m: float
 
 
 @dataclass(frozen=True)

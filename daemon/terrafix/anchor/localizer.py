@@ -127,6 +127,7 @@ class Localizer:
         self._place_test: PlaceTest | None = None  # while a drawn map is searched
         self._place_budget = FalseAlarmBudget()
         self._since_observation_m = np.inf  # motion since the last observation
+        self._since_single_frame_m = np.inf  # motion since a place was last sought by the patches of one frame
         self._scale_matched = False  # the last frame had a pose at the predicted scale
         self._poor_weight = 0.0
         self._variance_m2 = 0.0  # horizontal position variance of the last prediction
@@ -212,7 +213,9 @@ class Localizer:
                 sigma_m = float(np.sqrt(max(step_var + step_m**2, growth)))
             self._relocalizer.predict(prediction.step_m, float(np.sqrt(step_var)))  # for the sequential test
             predict_belief(self._belief, prediction, sigma_m, cell_m)
-        self._since_observation_m += float(np.hypot(step_m, sigma_m))
+        moved_m = float(np.hypot(step_m, sigma_m))
+        self._since_observation_m += moved_m
+        self._since_single_frame_m += moved_m
 
     def _initialize_belief(self, prediction: Prediction, best: MapLayer, origin: Origin, cell_m: float) -> float:
         """Belief around the first prediction; starts a search if the start is unknown. -> 1-sigma of the belief."""
@@ -316,7 +319,9 @@ class Localizer:
             self._place_test, self._relocalizer.sigma_m, self._lock_monitor = None, 0.0, LockMonitor()
         sigma_m = position_sigma_m(prediction)
         pose = estimate_pose(match, prediction, seen, modes[0], hypothesis)
-        if not pose.attempted and not seen.layer.drawn and seen.new >= 1.0 and has_wide_sigma(sigma_m, view.agl_m):
+        # Not "seen.new >= 1": a copter's observations are closer to each other than that, and none would be used.
+        is_new_ground = self._since_single_frame_m >= NEW_GROUND_SHARE * seen.footprint_m
+        if not pose.attempted and not seen.layer.drawn and is_new_ground and has_wide_sigma(sigma_m, view.agl_m):
             pose = self._localize_alone(pose, seen, belief)
         self._lock_monitor.update(evidence_nats, seen.weight, seen.new, pose.inliers, sigma_m, view.agl_m)
         mode_view = view_at(view, hypothesis, pose.mode.e_m, pose.mode.n_m) if pose.attempted else None
@@ -357,7 +362,7 @@ class Localizer:
         new = min(self._since_observation_m / (NEW_GROUND_SHARE * footprint_m), 1.0)
         weight = max(new, MIN_OBSERVATION_WEIGHT)
         used, correlation = layers.select(results, belief.mode(), weight)
-        return Observation(image, view, used, correlation, new, weight)
+        return Observation(image, view, used, correlation, new, weight, footprint_m)
 
     @staticmethod
     def _may_be_on_map(best: MapLayer, prediction: Prediction) -> bool:
@@ -377,6 +382,7 @@ class Localizer:
     def _localize_alone(self, pose: PoseResult, seen: Observation, belief: Belief) -> PoseResult:
         """Selection of a mode by the patches of this frame alone; ``pose`` itself if no mode is selected."""
         view, layer = seen.view, seen.layer
+        self._since_single_frame_m = 0.0
         self._single_frame_budget.spend()
         null, log_probability = layer.null_at(view.agl_m), self._single_frame_budget.log_probability
         place = localize_single_frame(

@@ -118,3 +118,21 @@ def test_an_undecided_correlation_is_decided_by_patches_if_the_position_sigma_is
     assert log_probabilities == ([SHARE] if verdict is Verdict.ACCEPTED else [])
     if verdict is Verdict.ACCEPTED:
         assert np.linalg.norm(np.array(position_of(match)) - TRUE_M) < 3.0
+
+
+def test_small_steps_add_up_to_the_new_ground_that_another_single_frame_needs(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A copter moves a few metres between two images; its frames are never a third of a footprint apart."""
+    monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # no evidence
+    tried = list[int]()
+    monkeypatch.setattr("terrafix.anchor.localizer.localize_single_frame", lambda *_: tried.append(frame_id))
+    package: Any = SingleMapPackage(ground)
+    frames = MemoryFrameStore(2)
+    node = AnchorNode(frames, package, GradientDescriber(), 1.0)
+    list(node.on(ORIGIN))
+    for frame_id in range(1, 13):
+        frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
+        list(node.on(predicted(frame_id, 90.0, step_m=0.0 if frame_id == 1 else 0.1 * AGL_M)))
+    assert tried[0] == 1 and 2 not in tried
+    assert 2 <= len(tried) <= 4, "12 steps are 1.1 heights of motion"
