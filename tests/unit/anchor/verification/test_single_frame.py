@@ -125,7 +125,7 @@ def test_small_steps_add_up_to_the_new_ground_that_another_single_frame_needs(
 ) -> None:
     """A copter moves a few metres between two images; its frames are never a third of a footprint apart."""
     monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # no evidence
-    tried = list[int]()
+    tried, frame_id = list[int](), 0
     monkeypatch.setattr("terrafix.anchor.localizer.localize_single_frame", lambda *_: tried.append(frame_id))
     package: Any = SingleMapPackage(ground)
     frames = MemoryFrameStore(2)
