@@ -16,14 +16,14 @@ import cv2
 import numpy as np
 import urllib3
 
-import map_format1
+import small_map
 from terrafix_tools.console.app import make_app
 from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.console.serve import Server, config_of
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.settings import Settings
 
-MAP = "format1"
+MAP = "small"
 CAMERA = {"width": 640, "height": 480, "fx": 500.0}
 NEW = {"camera": CAMERA, "map": MAP}
 WAIT_S = 20.0  # longest wait for the service
@@ -45,8 +45,8 @@ class Answer:
 def settings(folder: Path, **changes: Any) -> Settings:
     """Of a service with one small map that computes no flight (``workers`` 0)."""
     (folder / "maps").mkdir(parents=True, exist_ok=True)
-    if not (folder / "maps" / "format1.gpkg").is_file():
-        map_format1.unpack(folder / "maps")
+    if not (folder / "maps" / small_map.NAME).is_file():
+        small_map.write(folder / "maps")
     return Settings(**{"data": folder, "port": 0, "workers": 0, "nice": 0, **changes})
 
 

@@ -16,8 +16,8 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.estimator.node import EstimatorNode
 from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
-from terrafix.runtime.executor import InProcessShell
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.in_process import InProcessShell
 
 pytestmark = pytest.mark.slow
 AWAY_M = (700.0, -400.0)  # home, east and north of the Origin

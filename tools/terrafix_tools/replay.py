@@ -24,11 +24,11 @@ from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import header, versions
-from terrafix.runtime.executor import InProcessShell
 from terrafix.vision.sources import Source, open_source
 from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import StoredModel, models_folder, resolve_model
 from terrafix_tools.flight_map import package_of
+from terrafix_tools.in_process import InProcessShell
 from terrafix_tools.live import swapped_hint
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.rerun.frames import RecordedFrames

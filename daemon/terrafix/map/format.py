@@ -10,7 +10,7 @@ import msgspec
 
 from terrafix.map.null_model import NullModel
 
-FORMAT_VERSION = 2  # version 1: one imagery layer, private elevation table, georeference not covered by the checksum
+FORMAT_VERSION = 2  # of packages that are written and read
 APPLICATION_ID = 0x47504B47  # "GPKG", OGC 12-128r18 requirement 2
 IMAGERY_TABLE = "imagery"  # the first layer; further ones are imagery_2, imagery_3, ...
 DRAWN_TABLE = "drawn"  # the layer that is drawn from roads, water and buildings

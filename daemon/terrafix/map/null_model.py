@@ -93,8 +93,8 @@ class NullModel(msgspec.Struct, frozen=True, kw_only=True):
 
 
 # Default for an unmeasured map: twenty flights on maps of other places, 388 stretches, 3906 frames at places
-# (docs/search.md, "Wrong maps, measured"; ``bench/search/wrong_maps.py``). ``places`` is their mean: in a pooled sample
-# the larger maps contribute more of the tail.
+# (docs/search.md, "Wrong maps, measured"). ``places`` is their mean: in a pooled sample the larger maps contribute more
+# of the tail.
 DEFAULT_NULL = NullRow(
     agl_m=100.0,
     places=24_000.0,

@@ -38,7 +38,7 @@ class MapPackage:
         self.signed_by: tuple[str, ...] = ()  # ids of the signing keys
         self._db = db
         self._close = weakref.finalize(self, db.close)
-        self.tiles = TileStore(db, manifest.format_version)
+        self.tiles = TileStore(db)
         self.crs = CRS.from_user_input(manifest.crs)
         self._from_wgs84 = {
             layer.table: Transformer.from_crs(4326, layer.crs, always_xy=True) for layer in manifest.layers

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from terrafix.map import format_v1
 from terrafix.map.format import (
     DEM_NULL,
     DEM_TILE_PX,
@@ -30,9 +29,8 @@ Part = tuple[slice, slice]  # rows and columns
 class TileStore:
     """Decoded tiles. A damaged tile counts as missing and is listed in ``damaged``."""
 
-    def __init__(self, db: sqlite3.Connection, format_version: int) -> None:
+    def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
-        self._is_format_1 = format_version == 1
         self.damaged: set[Key] = set()
         self._cache: OrderedDict[Key, Tile | None] = OrderedDict()
         self._cached_bytes = 0
@@ -78,9 +76,6 @@ class TileStore:
 
     def hashes(self) -> Iterator[HashRow]:
         """Recorded hashes of all tiles, in order."""
-        if self._is_format_1:
-            yield from sorted(format_v1.hashes(self._db))
-            return
         yield from self._db.execute(f"SELECT table_name, zoom_level, tile_column, tile_row, sha256 FROM {HASH_TABLE}")
 
     def matches_hash(self, key: Key, sha256: bytes) -> bool:
@@ -93,8 +88,7 @@ class TileStore:
         self._cached_bytes = 0
 
     def _read_tile(self, key: Key) -> tuple[bytes, float | None, float | None] | None:
-        """Encoded bytes of a tile; scale and offset for elevation of format 2, else None. None: no such tile, or
-        an empty one."""
+        """Encoded bytes of a tile; scale and offset for elevation, else None. None: no such tile, or an empty one."""
         table, zoom, column, row = key
         if table != ELEVATION_TABLE:
             found = self._db.execute(
@@ -102,36 +96,23 @@ class TileStore:
                 " WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?",
                 (zoom, column, row),
             ).fetchone()
-        elif self._is_format_1:
-            found = self._db.execute(
-                f"SELECT CAST(tile_data AS BLOB) FROM {format_v1.DEM_TABLE} WHERE tile_column = ? AND tile_row = ?",
-                (column, row),
-            ).fetchone()
-        else:
-            found = self._db.execute(
-                f"SELECT CAST(tile_data AS BLOB), scale, offset FROM {ELEVATION_TABLE}"
-                " JOIN gpkg_2d_gridded_tile_ancillary"
-                f" ON tpudt_name = '{ELEVATION_TABLE}' AND tpudt_id = {ELEVATION_TABLE}.id"
-                " WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?",
-                (zoom, column, row),
-            ).fetchone()
-            return None if found is None or None in found else (found[0], float(found[1]), float(found[2]))
-        return None if found is None or None in found else (found[0], None, None)
+            return None if found is None or None in found else (found[0], None, None)
+        found = self._db.execute(
+            f"SELECT CAST(tile_data AS BLOB), scale, offset FROM {ELEVATION_TABLE}"
+            " JOIN gpkg_2d_gridded_tile_ancillary"
+            f" ON tpudt_name = '{ELEVATION_TABLE}' AND tpudt_id = {ELEVATION_TABLE}.id"
+            " WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?",
+            (zoom, column, row),
+        ).fetchone()
+        return None if found is None or None in found else (found[0], float(found[1]), float(found[2]))
 
     def _read_hash(self, key: Key) -> bytes | None:
         """Recorded sha256 of a tile; None: no such tile."""
-        if self._is_format_1:
-            where = (-1 if key[0] == ELEVATION_TABLE else key[1], key[2], key[3])
-            found = self._db.execute(
-                f"SELECT sha256 FROM {format_v1.HASH_TABLE} WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?",
-                where,
-            ).fetchone()
-        else:
-            found = self._db.execute(
-                f"SELECT sha256 FROM {HASH_TABLE}"
-                " WHERE table_name = ? AND zoom_level = ? AND tile_column = ? AND tile_row = ?",
-                key,
-            ).fetchone()
+        found = self._db.execute(
+            f"SELECT sha256 FROM {HASH_TABLE}"
+            " WHERE table_name = ? AND zoom_level = ? AND tile_column = ? AND tile_row = ?",
+            key,
+        ).fetchone()
         return None if found is None else found[0]
 
     def _load(self, key: Key) -> Tile | None:
@@ -147,8 +128,6 @@ class TileStore:
             self.damaged.add(key)
             return None
         data, scale, offset = stored
-        if key[0] == ELEVATION_TABLE and self._is_format_1:
-            return _elevation_tile(format_v1.heights(data))
         if scale is not None and offset is not None:
             image = _decode_image(data)
             assert image.shape == (DEM_TILE_PX, DEM_TILE_PX) and image.dtype == np.uint16

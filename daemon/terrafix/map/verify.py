@@ -10,7 +10,6 @@ import msgspec
 
 from terrafix.core.errors import MapError
 from terrafix.core.signature import TrustedKey, is_signed
-from terrafix.map import format_v1
 from terrafix.map.format import (
     APPLICATION_ID,
     DRAWN_TABLE,
@@ -59,24 +58,16 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
         )
     rows = dict(typed_rows(db, f"SELECT key, value FROM {MANIFEST_TABLE}", tuple[str, str]))
     version = rows.get("format_version", "")
-    if version.isdigit() and int(version) > FORMAT_VERSION:
-        raise MapError(
-            f"{path}: map package of format {version}, this Terrafix reads up to {FORMAT_VERSION}; update Terrafix"
-        )
-    is_format_1 = version == "1"
+    if version.isdigit() and int(version) != FORMAT_VERSION:
+        remedy = "update Terrafix" if int(version) > FORMAT_VERSION else "build it again"
+        raise MapError(f"{path}: map package of format {version}, this Terrafix reads {FORMAT_VERSION}; {remedy}")
     pictures = DRAWN_TABLE if DRAWN_TABLE in tables else IMAGERY_TABLE
-    missing = (format_v1.TABLES if is_format_1 else {pictures, HASH_TABLE}) - tables
+    missing = {pictures, HASH_TABLE} - tables
     if missing:
         raise MapError(f"{path}: damaged map package (no table {min(missing)}); build or copy it again")
-    hashes: list[HashRow]
-    if is_format_1:
-        hashes = format_v1.hashes(db)
-        checksum = format_v1.checksum_of(rows, hashes)
-    else:
-        columns = "table_name, zoom_level, tile_column, tile_row, sha256"
-        hashes = typed_rows(db, f"SELECT {columns} FROM {HASH_TABLE}", tuple[str, int, int, int, bytes])
-        checksum = checksum_of(rows.items(), hashes)
-    if checksum != rows.get("checksum"):
+    columns = "table_name, zoom_level, tile_column, tile_row, sha256"
+    hashes: list[HashRow] = typed_rows(db, f"SELECT {columns} FROM {HASH_TABLE}", tuple[str, int, int, int, bytes])
+    if checksum_of(rows.items(), hashes) != rows.get("checksum"):
         raise MapError(f"{path}: checksum mismatch, the package was altered; build or copy it again")
     fields: dict[str, Any] = {}
     try:
@@ -85,8 +76,6 @@ def read_manifest(path: Path, db: sqlite3.Connection) -> Manifest:
                 continue
             text = rows[field.name]
             fields[field.name] = text if field.type is str else msgspec.json.decode(text, type=field.type)
-        if is_format_1:
-            fields["layers"] = (format_v1.layer(db, fields, len(hashes)),)
         manifest = Manifest(**fields)
     except (KeyError, TypeError, msgspec.DecodeError) as error:
         raise MapError(f"{path}: damaged manifest ({error}); build or copy the package again") from None
@@ -104,7 +93,7 @@ def check_signature(
     Raises MapError: a signature is wrong (altered after signing), no trusted key signed, or it is not signed."""
     tables = {row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     signed: list[str] = []
-    if SIGNATURE_TABLE in tables and manifest.format_version > 1:
+    if SIGNATURE_TABLE in tables:
         query = f"SELECT key_id, public_key, signature FROM {SIGNATURE_TABLE}"
         for key_id, public_key, signature in typed_rows(db, query, tuple[str, bytes, bytes]):
             key = TrustedKey(public_key)

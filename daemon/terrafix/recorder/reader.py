@@ -22,7 +22,6 @@ from mcap.writer import MCAP0_MAGIC
 from terrafix.core.errors import SourceError
 from terrafix.messages import Message
 from terrafix.recorder.foxglove import IMAGE_TOPIC, THUMBNAIL_TOPIC
-from terrafix.recorder.old_format import OLD_DECODERS, OLD_FORMAT
 from terrafix.recorder.provenance import RECORD_FORMAT
 from terrafix.recorder.schema import TYPE_BY_TOPIC, topic_of
 from terrafix.recorder.writer import CALIBRATION_NAME, HEADER_NAME, decode_image
@@ -45,7 +44,6 @@ _CORRUPT = (
 _DAMAGED_IMAGE = (msgspec.DecodeError, KeyError, TypeError, ValueError)  # exceptions of decode_image
 
 _DECODERS = {topic: msgspec.json.Decoder(t).decode for topic, t in TYPE_BY_TOPIC.items()}
-_DECODERS_OF_OLD = {**_DECODERS, **OLD_DECODERS}
 
 
 @dataclass
@@ -88,10 +86,10 @@ def check_format(path: Path, result: ReadResult) -> None:
     where = ", ".join(file.name for file in result.files)
     if not result.header:
         raise SourceError(f"{path}: {where} is not a flight record, or ends before its head; give another")
-    if result.header["format"] not in (RECORD_FORMAT, OLD_FORMAT):
+    if result.header["format"] != RECORD_FORMAT:
         raise SourceError(
             f"{path}: {where} is a record of format '{result.header['format']}', and this program reads "
-            f"'{RECORD_FORMAT}' and '{OLD_FORMAT}'; read it with the version that wrote it"
+            f"'{RECORD_FORMAT}'; read it with the version that wrote it"
         )
 
 
@@ -104,15 +102,15 @@ def read_flight(path: Path, result: ReadResult | None = None) -> Iterator[tuple[
 def read_received(path: Path, result: ReadResult | None = None) -> Iterator[tuple[str, int, int, Message]]:
     """Like read_flight, with the reception time at the recorder: (topic, log_time_ns, received_ns, message)."""
     result = ReadResult() if result is None else result
-    for file_format, channel, record in _records(path, result):
-        message = _message(file_format, channel, record, result)
+    for channel, record in _records(path, result):
+        message = _message(channel, record, result)
         if message is not None:
             yield topic_of(type(message)), record.log_time, record.publish_time, message
 
 
-def _message(file_format: str, channel: Channel, record: McapMessage, result: ReadResult) -> Message | None:
+def _message(channel: Channel, record: McapMessage, result: ReadResult) -> Message | None:
     """None: a channel that has none of our messages, or a message of another version."""
-    decode = (_DECODERS_OF_OLD if file_format == OLD_FORMAT else _DECODERS).get(channel.topic)
+    decode = _DECODERS.get(channel.topic)
     if decode is None:
         return None
     try:
@@ -134,12 +132,12 @@ class FrameImage:
 def read_with_images(path: Path, result: ReadResult | None = None) -> Iterator[Message | FrameImage]:
     """Yields messages and frames at full size in the order of the record."""
     result = ReadResult() if result is None else result
-    for file_format, channel, record in _records(path, result):
+    for channel, record in _records(path, result):
         if channel.topic == IMAGE_TOPIC:
             with suppress(*_DAMAGED_IMAGE):
                 yield FrameImage(*decode_image(record.data))
             continue
-        message = _message(file_format, channel, record, result)
+        message = _message(channel, record, result)
         if message is not None:
             yield message
 
@@ -157,7 +155,7 @@ def read_frame_images(path: Path) -> Iterator[FrameImage]:
 
 
 def _images(path: Path, topic: str) -> Iterator[tuple[int, str, bytes]]:
-    for _, channel, record in _records(path, ReadResult()):
+    for channel, record in _records(path, ReadResult()):
         if channel.topic == topic:
             with suppress(*_DAMAGED_IMAGE):
                 yield decode_image(record.data)
@@ -166,32 +164,30 @@ def _images(path: Path, topic: str) -> Iterator[tuple[int, str, bytes]]:
 def read_with_thumbnails(path: Path, kinds: Collection[type[Message]]) -> Iterator[Message | tuple[int, bytes]]:
     """Yields the messages of some types, and all thumbnails as (frame id, JPEG), in the order of the record."""
     topics = {topic_of(kind) for kind in kinds}
-    for file_format, channel, record in _records(path, ReadResult()):
+    for channel, record in _records(path, ReadResult()):
         with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
             if channel.topic == THUMBNAIL_TOPIC:
                 frame_id, _, jpeg = decode_image(record.data)
                 yield frame_id, jpeg
             elif channel.topic in topics:
-                yield (_DECODERS_OF_OLD if file_format == OLD_FORMAT else _DECODERS)[channel.topic](record.data)
+                yield _DECODERS[channel.topic](record.data)
 
 
-def _records(path: Path, result: ReadResult) -> Iterator[tuple[str, Channel, McapMessage]]:
-    """Yields (format of the file, channel, message)."""
+def _records(path: Path, result: ReadResult) -> Iterator[tuple[Channel, McapMessage]]:
     for file in flight_files(path):
         result.files.append(file)
         with file.open("rb") as stream:
             yield from _records_of(file, stream, result)
 
 
-def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[tuple[str, Channel, McapMessage]]:
+def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[tuple[Channel, McapMessage]]:
     """Reads sequentially, because the index is at the end of the file, which a truncated file lacks."""
     channels: dict[int, Channel] = {}
-    file_format, first = "", True
+    first = True
     for record in _contents(file, stream, result):
         if isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, Metadata) and record.name == HEADER_NAME:
-            file_format = record.metadata.get("format", "")
             result.header = result.header or _header(record.metadata)
         elif isinstance(record, Metadata) and record.name == CALIBRATION_NAME:
             result.header.setdefault("calibration", _decoded(record.metadata.get("camera", "{}")))
@@ -199,7 +195,7 @@ def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[t
             if first:
                 result.segment_starts_ns.append(record.publish_time)
                 first = False
-            yield file_format, channels[record.channel_id], record
+            yield channels[record.channel_id], record
 
 
 def _header(metadata: dict[str, str]) -> dict[str, Any]:

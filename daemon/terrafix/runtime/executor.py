@@ -1,12 +1,12 @@
-"""The two shells that run nodes: in one process (replay, simulation, tests) and live (one process each, on the bus).
+"""The shell that runs a node live: one process each, on the bus.
 
-Nodes run unchanged in both. The live shell owns the clock, the sockets and the edge, which a node may not have. It has
-a single thread, so that a slow node delays only its own process."""
+Nodes run unchanged in one process as well (replay, simulation, tests). The live shell owns the clock, the sockets and
+the edge, which a node may not have. It has a single thread, so that a slow node delays only its own process."""
 
 import gc
 import importlib
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable
 
 import msgspec
 import zmq
@@ -17,7 +17,7 @@ from terrafix.core.clock import Ticker, now_ns
 from terrafix.core.log_lines import MessageLog
 from terrafix.core.node import Edge, Node, NodeContext
 from terrafix.messages import Dropped, InputOrder, LogLine, Message, NavEstimate, Origin, PositionHint, ProcessEvent
-from terrafix.processes import OPERATOR, PROCESSES, SOURCE, SUPERVISOR, Process
+from terrafix.processes import OPERATOR, PROCESSES, SUPERVISOR, Process
 from terrafix.runtime.bus import Publisher, Subscriber
 from terrafix.runtime.inbox import Inbox
 from terrafix.runtime.input_order import InputLog
@@ -33,50 +33,6 @@ SUBSCRIBERS_WAIT_NS = 20_000_000_000  # longest wait of the source for the subsc
 RECORDER_WAIT_NS = 200_000_000
 STOP_DRAIN_NS = 2_000_000_000  # at a stop, queued messages are still processed for at most this long
 STOP_QUIET_MS = 100  # the queues count as empty after this long without a message
-
-
-class InProcessShell:
-    """All nodes in one process, one message at a time: deterministic, the same input gives the same output."""
-
-    def __init__(
-        self,
-        nodes: Mapping[str, Node],
-        sink: Callable[[str, Message], None],
-        *,
-        table: tuple[Process, ...] = PROCESSES,
-    ) -> None:
-        """``nodes`` by process name. ``sink(publisher, message)`` gets every message once, in the order of delivery.
-
-        Raises ValueError for a node that is not in the process table."""
-        self._nodes = [(process, nodes[process.name]) for process in table if process.name in nodes]
-        unknown = set(nodes) - {process.name for process, _ in self._nodes}
-        if unknown:
-            raise ValueError(f"not in the process table: {', '.join(sorted(unknown))}")
-        self._sink = sink
-        self._tickers: dict[str, Ticker] = {}
-
-    def feed(self, message: Message) -> None:
-        """Delivers ``message`` and all resulting messages, breadth first, to subscribers in table order."""
-        self._deliver(deque([(SOURCE, message)]))
-
-    def tick(self, now_ns: int) -> None:
-        """Ticks once every node whose period has passed; the first call sets the phase."""
-        pending: deque[tuple[str, Message]] = deque()
-        for process, node in self._nodes:
-            if process.tick_hz > 0:
-                ticker = self._tickers.setdefault(process.name, Ticker(process.tick_hz, now_ns))
-                if ticker.due(now_ns):
-                    pending.extend((process.name, m) for m in node.tick(now_ns))
-        self._deliver(pending)
-
-    def _deliver(self, pending: deque[tuple[str, Message]]) -> None:
-        """Delivers (publisher, message) pairs and all resulting messages until the queue is empty."""
-        while pending:
-            publisher, message = pending.popleft()
-            self._sink(publisher, message)
-            for process, node in self._nodes:
-                if process.name != publisher and isinstance(message, process.subscribes):
-                    pending.extend((process.name, m) for m in node.on(message))
 
 
 def run_process(

@@ -1,5 +1,5 @@
 """Evaluation on held-out places: camera image and map of different dates, with the pose errors of a flight (heading,
-height, tilt) only. It tracks the training; `terrafix_tools.bench.two_dates --model` evaluates the whole matcher."""
+height, tilt) only. It tracks the training; `terrafix models bench` and flights evaluate the weights."""
 
 from dataclasses import dataclass
 

@@ -13,9 +13,9 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.estimator.node import EstimatorNode
 from terrafix.link.node import LinkNode
-from terrafix.runtime.executor import InProcessShell
 from terrafix.runtime.inbox import merge_predictions
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.in_process import InProcessShell
 from textured_ground import PINHOLE, texture, view
 
 FRAME = LocalFrame(ORIGIN.lat_deg, ORIGIN.lon_deg)

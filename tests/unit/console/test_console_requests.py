@@ -50,7 +50,7 @@ def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
     assert answer.status == 201
     flight = answer.json
     assert flight["state"] == "processing" and flight["kind"] == "batch" and flight["last_event_id"] == 0
-    assert flight["map"] == {"name": "format1", "state": "ready", "detail": ""}
+    assert flight["map"] == {"name": "small", "state": "ready", "detail": ""}
     assert answer.headers["location"] == f"/flights/{flight['flight_id']}"
     assert console.send("GET", answer.headers["location"]).json == flight
     assert flight in console.send("GET", "/flights").json["flights"]
@@ -220,14 +220,14 @@ def test_a_fix_needs_a_frame_and_hints_are_numbered(console: Console) -> None:
 
 
 def test_maps_have_bounds_and_tiles(console: Console) -> None:
-    info = console.send("GET", "/maps/format1").json
+    info = console.send("GET", "/maps/small").json
     assert console.send("GET", "/maps").json == {"maps": [info]}
     west, south, east, north = info["bounds"]
     assert west < east and south < north and info["gsd_m"] == pytest.approx(0.5, rel=1e-3)
     assert_refused(console.send("GET", "/maps/other"), 404)
-    assert_refused(console.send("GET", "/maps/format1/tiles/3/8/0.png"), 404, "0 to 7")
+    assert_refused(console.send("GET", "/maps/small/tiles/3/8/0.png"), 404, "0 to 7")
     assert_refused(console.send("GET", "/maps/..%2F..%2Fetc%2Fpasswd"), 404)
-    tile = console.send("GET", "/maps/format1/tiles/0/0/0.png")
+    tile = console.send("GET", "/maps/small/tiles/0/0/0.png")
     assert tile.status == 200 and tile.body.startswith(b"\x89PNG") and tile.headers["content-type"] == "image/png"
 
 

@@ -14,11 +14,10 @@ from pyarrow import fs
 from typer.testing import CliRunner, Result
 
 from dying_examiner import DyingExaminer
+from fleet_records import Invented, write_records
 from map_cluster import local_cluster
 from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix.recorder.writer import FlightWriter
-from terrafix_tools.bench.fleet import build_command, flights_in
-from terrafix_tools.bench.fleet_records import Invented, write_records
 from terrafix_tools.cli import app
 from terrafix_tools.fleet import build as build_module
 from terrafix_tools.fleet.build import DEATHS, DEATHS_ALONE, KILLED, build, examine_all, processes
@@ -39,6 +38,15 @@ def tree(fleet: Path) -> dict[str, bytes]:
 
 def rows(fleet: Path, sql: str) -> list[tuple[object, ...]]:
     return query(fleet, sql).rows
+
+
+def build_command(source: Path, out: Path) -> list[str]:
+    arguments = ["fleet", "build", str(source), "--out", str(out), "--workers", "1"]
+    return [sys.executable, "-m", "terrafix_tools.program", *arguments]
+
+
+def flights_in(out: Path) -> int:
+    return len(list((out / "flights").glob("date=*/flight=*/part.parquet")))
 
 
 def call(*arguments: object) -> Result:
@@ -296,7 +304,7 @@ def test_a_build_that_is_killed_is_resumed(tmp_path: Path) -> None:
     """The real command, killed with SIGKILL after its first flights."""
     write_records(tmp_path / "records", RECORDS, frames=600)
     fleet = tmp_path / "fleet"
-    building = subprocess.Popen(build_command(tmp_path / "records", fleet, 1), stderr=subprocess.DEVNULL)
+    building = subprocess.Popen(build_command(tmp_path / "records", fleet), stderr=subprocess.DEVNULL)
     while flights_in(fleet) < 2 and building.poll() is None:
         time.sleep(0.005)
     building.kill()
@@ -313,7 +321,7 @@ def test_a_dask_cluster_gives_the_same_tables_also_when_a_worker_is_killed(tmp_p
     build(str(tmp_path / "records"), tmp_path / "here", workers=1)
     (tmp_path / "cluster").mkdir()
     with local_cluster(tmp_path / "cluster", workers=2) as cluster:
-        command = [*build_command(tmp_path / "records", tmp_path / "there", 1), "--scheduler", cluster.address]
+        command = [*build_command(tmp_path / "records", tmp_path / "there"), "--scheduler", cluster.address]
         building = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         while flights_in(tmp_path / "there") < 1 and building.poll() is None:
             time.sleep(0.01)
@@ -383,7 +391,7 @@ def test_an_unreachable_scheduler_is_one_line(records: Path, tmp_path: Path) -> 
 
 
 def test_without_pyarrow_one_line_states_what_to_install(records: Path, tmp_path: Path) -> None:
-    command = build_command(records, tmp_path / "fleet", 1)
+    command = build_command(records, tmp_path / "fleet")
     code = "import sys; sys.modules['pyarrow'] = None; from terrafix_tools.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *command[3:]], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2

@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 import pytest
 
+from fleet_records import Invented, write_records
 from flight_records import PERIOD_NS, live_messages, write_record
 from terrafix import messages as m
 from terrafix.recorder.writer import FlightWriter
-from terrafix_tools.bench.fleet_records import Invented, write_records
 from terrafix_tools.estimates import Row
 from terrafix_tools.fleet.build import build
 from terrafix_tools.fleet.examine import Examiner

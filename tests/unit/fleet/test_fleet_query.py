@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from fleet_records import LAKE_M, LAKE_RADIUS_M, write_records
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix_tools.bench.fleet_records import LAKE_M, LAKE_RADIUS_M, write_records
 from terrafix_tools.cli import app
 from terrafix_tools.fleet.build import build
 from terrafix_tools.fleet.page import write_page

@@ -11,8 +11,8 @@ from terrafix import messages as m
 from terrafix.core import codec
 from terrafix.core.clock import Ticker
 from terrafix.processes import ALL_MESSAGES, PROCESSES, SOURCE, Process
-from terrafix.runtime.executor import InProcessShell
 from terrafix.runtime.inbox import Inbox
+from terrafix_tools.in_process import InProcessShell
 
 
 def frame(frame_id: int) -> m.Frame:

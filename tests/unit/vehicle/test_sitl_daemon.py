@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+import small_map
 from link_port import free_port
-from map_format1 import unpack
 
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
 
@@ -56,7 +56,7 @@ def test_terrafix_stops_in_order_when_its_flight_is_killed(tmp_path: Path) -> No
     log = tmp_path / "terrafix.log"
     with socket.create_server(("127.0.0.1", 0)) as camera:
         source, link = f"http://127.0.0.1:{camera.getsockname()[1]}/", f"udpin:127.0.0.1:{free_port()}"
-        command = [sys.executable, "-c", FLIGHT, str(tmp_path), str(unpack(tmp_path)), source, link]
+        command = [sys.executable, "-c", FLIGHT, str(tmp_path), str(small_map.write(tmp_path)), source, link]
         with subprocess.Popen(command) as flight:
             eventually(lambda: log.exists() and log.read_text().count("process started") == len(PROCESSES), 60.0)
             flight.kill()

@@ -1,4 +1,4 @@
-"""Several layers of different dates in one package, and packages of format 1."""
+"""Several layers of different dates in one package."""
 
 from functools import partial
 from pathlib import Path
@@ -9,7 +9,6 @@ import rasterio
 from pyproj import Transformer
 from rasterio.transform import Affine
 
-import map_format1
 import map_rasters
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
@@ -109,27 +108,3 @@ def test_elevation_is_built_for_the_newest_layer(tmp_path: Path) -> None:
     assert opened.manifest.dem is not None
     assert (opened.manifest.dem.source, opened.manifest.dem.licence) == ("d.tif", "open")
     opened.close()
-
-
-def test_a_format_1_package_is_readable(tmp_path: Path) -> None:
-    opened = MapPackage.open(map_format1.unpack(tmp_path), verify=True)
-    manifest = opened.manifest
-    assert (manifest.format_version, manifest.date, manifest.licence, manifest.ce90_m) == (1, "2020-07-10", "CC0", 4.0)
-    (layer,) = manifest.layers
-    assert (layer.table, layer.date, layer.ce90_m, layer.crs) == ("imagery", "2020-07-10", 4.0, "EPSG:32651")
-    lon_deg, lat_deg = Transformer.from_crs(32651, 4326, always_xy=True).transform(300_025.0, 2_599_970.0)
-    assert opened.covers(lat_deg, lon_deg)
-    assert opened.ground_amsl_m(lat_deg, lon_deg) == pytest.approx(100 + 0.05 * 25 + 0.02 * 30, abs=0.02)
-    image, valid = opened.bind(LocalFrame(lat_deg, lon_deg)).window(-15, 15, 60, 60, 0.5)
-    assert valid.all() and image.std() > 20
-    assert not opened.damaged_tiles
-    opened.close()
-
-
-def test_damage_in_a_format_1_package_is_detected(tmp_path: Path) -> None:
-    path = map_format1.unpack(tmp_path)
-    content = path.read_bytes()
-    at = content.index(b"\x89PNG") + 3000  # in the middle of a tile
-    path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
-    with pytest.raises(MapError, match="altered or lost"):
-        MapPackage.open(path, verify=True)

@@ -52,9 +52,12 @@ def test_missing_foreign_and_truncated_files_are_rejected(tmp_path: Path, packag
         MapPackage.open(package)
 
 
-def test_a_future_format_asks_for_an_update(package: Path) -> None:
-    change(package, "UPDATE terrafix_manifest SET value = '99' WHERE key = 'format_version'")
-    with pytest.raises(MapError, match=r"format 99.*update Terrafix"):
+@pytest.mark.parametrize(("version", "remedy"), [("99", "update Terrafix"), ("1", "build it again")])
+def test_a_future_format_asks_for_an_update_and_an_earlier_one_for_a_build(
+    package: Path, version: str, remedy: str
+) -> None:
+    change(package, f"UPDATE terrafix_manifest SET value = '{version}' WHERE key = 'format_version'")
+    with pytest.raises(MapError, match=f"format {version}.*{remedy}"):
         MapPackage.open(package)
 
 

@@ -8,7 +8,6 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-import map_format1
 import map_rasters
 from terrafix.core.errors import ConfigError, MapError, OutputError, UsageError
 from terrafix.core.signature import TrustedKey, generate, is_signed, read_public, trusted_keys
@@ -171,15 +170,6 @@ def test_invalid_keys_are_reported(tmp_path: Path, package: Path) -> None:
     for paths in ([], [str(tmp_path / "empty")]):
         with pytest.raises(ConfigError, match="names no key"):
             trusted_keys(paths, required=True)
-
-
-def test_a_format_1_package_cannot_be_signed(tmp_path: Path) -> None:
-    first_format = map_format1.unpack(tmp_path)
-    private, _, key = keys(tmp_path)
-    with pytest.raises(MapError, match=r"format 1.*build it again"):
-        sign_package(first_format, private)
-    with pytest.raises(MapError, match="not signed"):
-        MapPackage.open(first_format, trusted=[key])
 
 
 def test_a_run_that_requires_signatures_rejects_an_unsigned_map_before_it_starts(tmp_path: Path, package: Path) -> None:

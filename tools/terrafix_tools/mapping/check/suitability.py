@@ -184,7 +184,7 @@ def _camera(path: Path | None) -> tuple[CameraCalibration, str]:
 def _age_years(date: str) -> float | None:
     try:
         return (datetime.date.today() - datetime.date.fromisoformat(date)).days / 365.25
-    except ValueError:  # empty, or from a package of format 1, which accepted any digits
+    except ValueError:  # empty
         return None
 
 

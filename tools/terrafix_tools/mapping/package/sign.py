@@ -3,10 +3,10 @@
 import sqlite3
 from pathlib import Path
 
-from terrafix.core.errors import MapError, OutputError
+from terrafix.core.errors import OutputError
 from terrafix.core.signature import TrustedKey, sign
 from terrafix.map.checksum import EMPTY_DIGEST, write_file_digest
-from terrafix.map.format import FORMAT_VERSION, SEAL_TABLE, SIGNATURE_TABLE, signed_bytes
+from terrafix.map.format import SEAL_TABLE, SIGNATURE_TABLE, signed_bytes
 from terrafix.map.package import DATABASE_ERRORS, MapPackage
 
 
@@ -17,11 +17,6 @@ def sign_package(package: Path, private_key: Path) -> TrustedKey:
     opened = MapPackage.open(package, verify=True)
     manifest = opened.manifest
     opened.close()
-    if manifest.format_version < FORMAT_VERSION:
-        raise MapError(
-            f"{package}: of format {manifest.format_version}, whose checksum leaves out where the imagery lies; "
-            "build it again and sign that"
-        )
     key, signature = sign(private_key, signed_bytes(manifest.checksum))
     try:
         db = sqlite3.connect(package)

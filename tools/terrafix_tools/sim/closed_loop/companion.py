@@ -27,7 +27,7 @@ from terrafix.messages import (
     ThermalReading,
 )
 from terrafix.processes import PROCESSES
-from terrafix.runtime.executor import InProcessShell
+from terrafix_tools.in_process import InProcessShell
 
 PROCESS_NAMES = ("vision", "anchor", "estimator", "smoother", "link", "health")
 HEALTH_NS = 1_000_000_000

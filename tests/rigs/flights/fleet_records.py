@@ -1,4 +1,4 @@
-"""Small flight records of an invented fleet, by the recorder's own writer: input of the fleet benchmark and its tests.
+"""Small flight records of an invented fleet, by the recorder's own writer: input of the tests of the fleet.
 
 Flights of several vehicles, maps, cameras and versions, over a year. The map fails over a lake of each place, and more
 often in winter."""
