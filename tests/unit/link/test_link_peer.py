@@ -17,6 +17,7 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from gps_messages import GPS
 from link_rig import ALT, LAT, LON, MS, SPEED_EAST, S, covariance, estimate, every, fly, gps, live
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
@@ -37,28 +38,10 @@ CONFIG = Path(__file__).resolve().parents[3] / "config"
 
 
 def message(**changes: Any) -> Any:
-    """A valid GPS_INPUT with changes."""
-    fields = dict(
-        time_usec=0,
-        gps_id=0,
-        ignore_flags=0,
-        time_week_ms=1000,
-        time_week=0,
-        fix_type=3,
-        lat=round(LAT * 1e7),
-        lon=round(LON * 1e7),
-        alt=500.0,
-        hdop=1.0,
-        vdop=1.0,
-        vn=1.0,
-        ve=2.0,
-        vd=0.0,
-        speed_accuracy=0.3,
-        horiz_accuracy=2.0,
-        vert_accuracy=3.0,
-        satellites_visible=6,
-    )
-    return mavlink.MAVLink_gps_input_message(**(fields | changes))
+    """A valid GPS_INPUT without GPS time, with other fields."""
+    sent = gps_input.encode(msgspec.structs.replace(GPS, time_week=0), 0)
+    vars(sent).update(changes)
+    return sent
 
 
 def fed(driver: GpsInputDriver, period_s: float, count: int, start_s: float = 0.0, **changes: Any) -> float:
@@ -351,18 +334,10 @@ def test_a_used_port_of_the_simulated_autopilot_raises_one_line() -> None:
 def test_the_simulated_autopilot_runs_in_its_own_process(tmp_path: Path) -> None:
     write_course(tmp_path / "course.csv", [(t / 2, course(t / 2)) for t in range(60)])
     out = tmp_path / "peer.json"
-    command = [
-        sys.executable,
-        "-m",
-        "terrafix_tools.sim.autopilot.process",
-        str(tmp_path / "course.csv"),
-        "--port",
-        "0",
-        "--out",
-        str(out),
-    ]
     zero_ns = time.monotonic_ns()
-    with subprocess.Popen([*command, "--start-ns", str(zero_ns)], stdout=subprocess.PIPE, text=True) as process:
+    options = ["--port", "0", "--out", str(out), "--start-ns", str(zero_ns)]
+    command = [sys.executable, "-m", "terrafix_tools.sim.autopilot.process", str(tmp_path / "course.csv"), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         port = int(process.stdout.readline().rsplit(":", 1)[1])
         flight = Flight()

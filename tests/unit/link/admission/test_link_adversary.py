@@ -7,8 +7,9 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_port import Speaker, free_port, station_heartbeat
+from link_port import Speaker, free_port
 from link_rig import ALT, LAT, LON, MS, SPEED_EAST, covariance, estimate, live, texts
+from link_wire import station_heartbeat
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import open_edge
@@ -62,7 +63,7 @@ class Forger:
         self._next_ns = now_ns + 40 * MS
         leaning = mavlink.MAVLink_attitude_message(now_ns // MS % 2**32, FORGED_ROLL, 0.0, 0.0, 0, 0, 0)
         hint = mavlink.MAVLink_set_gps_global_origin_message(self._sysid, 490_000_000, 120_000_000, 0)
-        self._speaker.send(self._to, leaning, station_heartbeat(), hint)
+        self._speaker.send(leaning, station_heartbeat(), hint, to=self._to)
 
 
 @pytest.mark.slow

@@ -3,17 +3,14 @@
 import math
 from typing import Any
 
-import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gnss_rig import accurate, feed_receiver, reading
 from link_rig import MS, S, estimate
-from link_wire import MemoryWire, heartbeat, packed
+from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
-from terrafix.core.config import LinkSection
 from terrafix.link.autopilot.gnss_receiver import gnss_reading
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.gnss.monitor import MIN_VISION_NS
 from terrafix.link.node import LinkNode
 from terrafix.messages import GnssState
@@ -206,11 +203,9 @@ def test_gnss_readings_are_converted_to_si_units_and_unknown_fields_are_none() -
     ("changes", "receivers"), [({}, [1]), ({"gps_id": 1}, [0]), ({"outputs": ["odometry"]}, [0, 1])]
 )
 def test_our_own_gps_input_is_not_read_as_a_receiver(changes: dict[str, Any], receivers: list[int]) -> None:
-    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
-    edge = MavlinkEdge(msgspec.convert(changes, LinkSection), wire, lambda: 0)
     second = mavlink.MAVLink_gps2_raw_message(1, 3, 1, 2, 3, 4, 5, 6, 7, 8, 0, 0)
-    wire.arrive(*(packed(message, autopilot) for message in (heartbeat(), gps_raw(), second)))
-    assert [x.receiver for x in edge.poll(0) if isinstance(x, m.GnssReading)] == receivers
+    published = WiredEdge(**changes).receives(0, heartbeat(), gps_raw(), second)
+    assert [x.receiver for x in published if isinstance(x, m.GnssReading)] == receivers
 
 
 # --- flights without images ---
