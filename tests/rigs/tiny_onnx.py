@@ -116,3 +116,52 @@ sizes = { batch = 1, height = 32, width = 64 }
 [[presets]]
 sizes = { batch = 1, height = 64, width = 64 }
 """
+GLOBAL = """name = "means"
+title = "mean colours of a grid"
+role = "global"
+licence = "CC0"
+[image]
+input = "image"
+colour = "rgb"
+multiple = 14
+mean = [0.485, 0.456, 0.406]
+std = [0.229, 0.224, 0.225]
+[vector]
+output = "vector"
+size = 12
+side_px = 28
+[[inputs]]
+name = "image"
+shape = [1, 3, 28, 28]
+[[outputs]]
+name = "vector"
+shape = [1, 12]
+"""
+PAIR = """name = "both"
+title = "an export that is given two pictures"
+role = "pair"
+licence = "CC0"
+[image]
+input = "image0"
+colour = "gray"
+multiple = 8
+[pair]
+second = "image1"
+keypoints = ["mkpts0", "mkpts1"]
+scores = "mconf"
+[[inputs]]
+name = "image0"
+shape = [1, 1, "height", "width"]
+[[inputs]]
+name = "image1"
+shape = [1, 1, "height", "width"]
+[[outputs]]
+name = "mkpts0"
+shape = ["pairs", 2]
+[[outputs]]
+name = "mkpts1"
+shape = ["pairs", 2]
+[[outputs]]
+name = "mconf"
+shape = ["pairs"]
+"""

@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from gps_messages import GPS
-from runtime_nodes import ORIGIN
+from runtime_nodes import ORIGIN, frame, prediction
 from terrafix import messages as m
 from terrafix.core import logs
 from terrafix.core.node import Edge
@@ -27,8 +27,11 @@ from terrafix.runtime.run_dir import RunDir
 pytestmark = pytest.mark.real_time
 
 
+Context = zmq.Context[zmq.Socket[bytes]]
+
+
 @pytest.fixture
-def context() -> Iterator["zmq.Context[zmq.Socket[bytes]]"]:
+def context() -> Iterator[Context]:
     with zmq.Context() as zmq_context:
         yield zmq_context
 
@@ -36,10 +39,6 @@ def context() -> Iterator["zmq.Context[zmq.Socket[bytes]]"]:
 @pytest.fixture
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> RunDir:
     return RunDir(tmp_path_factory.mktemp("r"))
-
-
-def frame(frame_id: int) -> m.Frame:
-    return m.Frame(t_ns=frame_id, frame_id=frame_id, file="", width=1, height=1)
 
 
 def collect(subscriber: Subscriber, publisher: Publisher, until: Callable[[list[m.Message]], bool]) -> list[m.Message]:
@@ -55,7 +54,7 @@ def collect(subscriber: Subscriber, publisher: Publisher, until: Callable[[list[
 
 
 def test_late_subscribers_get_the_retained_origin_and_others_do_not_get_it_twice(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+    context: Context, run_dir: RunDir
 ) -> None:
     address = run_dir.address("vision")
     early = Subscriber(context, [address], (m.Origin, m.Frame))  # before there is a publisher
@@ -74,9 +73,7 @@ def test_late_subscribers_get_the_retained_origin_and_others_do_not_get_it_twice
         side.close()
 
 
-def test_process_events_are_retained_for_ten_seconds(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
+def test_process_events_are_retained_for_ten_seconds(context: Context, run_dir: RunDir) -> None:
     clock_ns = [0]
     publisher = Publisher(context, run_dir.address("supervisor"), clock=lambda: clock_ns[0])
     for second in (0, 15, 16):
@@ -90,9 +87,7 @@ def test_process_events_are_retained_for_ten_seconds(
     publisher.close()
 
 
-def test_gps_input_is_retained_until_the_recorder_has_subscribed(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
+def test_gps_input_is_retained_until_the_recorder_has_subscribed(context: Context, run_dir: RunDir) -> None:
     address = run_dir.address("link")
     publisher = Publisher(context, address)
     status = Subscriber(context, [address], (m.GpsInput,))  # of another program, which is not the recorder
@@ -114,7 +109,7 @@ def test_gps_input_is_retained_until_the_recorder_has_subscribed(
 
 
 def test_subscribers_reconnect_to_a_restarted_publisher_and_receive_its_origin(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+    context: Context, run_dir: RunDir
 ) -> None:
     address = run_dir.address("vision")
     subscriber = Subscriber(context, [address], (m.Origin,))
@@ -132,7 +127,7 @@ def test_subscribers_reconnect_to_a_restarted_publisher_and_receive_its_origin(
 
 
 def test_messages_lost_by_a_slow_subscriber_are_counted_and_publishing_does_not_block(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+    context: Context, run_dir: RunDir
 ) -> None:
     publisher = Publisher(context, run_dir.address("vision"))
     slow = Subscriber(context, [run_dir.address("vision")], (m.Frame,))
@@ -182,23 +177,9 @@ PUBLISHER = Process("publisher", "", (), (m.Prediction,), 0.0, 1.0)
 LISTENER = Process("listener", "", ALL_MESSAGES, (), 0.0, 1.0)
 
 
-def prediction(frame_id: int) -> m.Prediction:
-    return m.Prediction(
-        t_ns=0,
-        frame_id=frame_id,
-        p_c_in_w_m=(0.0, 0.0, 0.0),
-        q_w_c=(1.0, 0.0, 0.0, 0.0),
-        cov=(0.0,) * 36,
-        agl_m=1.0,
-        agl_sigma_m=1.0,
-        step_m=(1.0, 0.0),
-        step_cov_m2=(1.0, 0.0, 0.0, 1.0),
-    )
-
-
 @pytest.mark.slow
 def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_ones(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+    context: Context, run_dir: RunDir
 ) -> None:
     table = (SLOW, PUBLISHER, LISTENER)
     progress = Progress.create(run_dir.progress("slow"))
@@ -215,7 +196,7 @@ def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_on
             time.sleep(0.01)
         time.sleep(0.1)
         for i in range(100):
-            publisher.publish(prediction(i))
+            publisher.publish(prediction(i, 1.0, 0.0))
             time.sleep(0.015)
         deadline = time.monotonic() + 5
         while not any(isinstance(h, m.MapMatch) and h.frame_id == 99 for h in received) and time.monotonic() < deadline:
@@ -272,9 +253,7 @@ class OneFrameEdge:
         self.closed = True
 
 
-def test_ticks_keep_the_time_grid_and_the_edge_is_polled_and_closed(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
+def test_ticks_keep_the_time_grid_and_the_edge_is_polled_and_closed(context: Context, run_dir: RunDir) -> None:
     process = Process("ticking", "", (), (m.Frame,), 50.0, 1.0)
     Progress.create(run_dir.progress("ticking")).close()
     node, edge = TickingNode(), OneFrameEdge()
@@ -311,7 +290,7 @@ def test_addresses_are_short_enough_for_unix_sockets() -> None:
 
 
 def test_a_subscriber_that_joins_a_busy_stream_receives_retained_messages_first(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+    context: Context, run_dir: RunDir
 ) -> None:
     """A subscription may arrive during a send: without XPUB_MANUAL thirty of a thousand late subscribers received a
     frame before Origin."""
@@ -339,13 +318,18 @@ def test_a_subscriber_that_joins_a_busy_stream_receives_retained_messages_first(
         thread.join(10)
 
 
+def shell_of(name: str, edge: Edge, run_dir: RunDir, context: Context) -> LiveShell:
+    """-> the shell of a process that publishes frames, with a listener beside it."""
+    process = Process(name, "", (), (m.Frame,), 0.0, 1.0)
+    Progress.create(run_dir.progress(name)).close()
+    return LiveShell(process, (process, LISTENER), TickingNode(), edge, run_dir, context)
+
+
 @pytest.mark.parametrize("late_s", [0.05, None], ids=["a late recorder", "no recorder"])
 def test_a_started_process_waits_for_the_recorder_so_that_its_first_message_is_recorded(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir, late_s: float | None
+    context: Context, run_dir: RunDir, late_s: float | None
 ) -> None:
-    process = Process("started", "", (), (m.Frame,), 0.0, 1.0)
-    Progress.create(run_dir.progress("started")).close()
-    shell = LiveShell(process, (process, LISTENER), TickingNode(), OneFrameEdge(), run_dir, context)
+    shell = shell_of("started", OneFrameEdge(), run_dir, context)
     over = threading.Event()
     began_s = time.monotonic()
     thread = threading.Thread(target=shell.run, args=(over.is_set,))
@@ -374,14 +358,12 @@ class LoggingEdge(OneFrameEdge):
 
 
 def test_lines_of_the_log_that_no_message_says_are_published_and_those_of_messages_are_not(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
+    context: Context, run_dir: RunDir
 ) -> None:
-    process = Process("logging", "", (), (m.Frame,), 0.0, 1.0)
-    Progress.create(run_dir.progress("logging")).close()
     stream = io.StringIO()
     writer = logs.configure("INFO", "logging", stream)
     edge = LoggingEdge()
-    shell = LiveShell(process, (process, LISTENER), TickingNode(), edge, run_dir, context)
+    shell = shell_of("logging", edge, run_dir, context)
     until = time.monotonic() + 0.6
     shell.run(lambda: time.monotonic() > until)
     shell.close()
