@@ -93,6 +93,11 @@ def packed(message: Any, mav: mavlink.MAVLink) -> bytes:
     return packet
 
 
+def decoded(message: Any, sysid: int = 1, compid: int = 1) -> Any:
+    """-> the message after encoding and decoding."""
+    return mavlink.MAVLink(None).decode(bytearray(packed(message, mavlink.MAVLink(None, sysid, compid))))
+
+
 def heartbeat(
     autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
     *,

@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 import gps_messages
 from autopilot_rig import GOOD, Rig
-from link_wire import WiredEdge, attitude, heartbeat, packed
+from link_wire import WiredEdge, attitude, decoded, heartbeat
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
 from terrafix.link.integrity.output_predictor import east_north_m, offset
@@ -36,10 +36,6 @@ GPS = msgspec.structs.replace(gps_messages.GPS, time_week=WEEK, time_week_ms=WEE
 NO_FIX = msgspec.structs.replace(GPS, fix_type=1, lat_deg=0.0, lon_deg=0.0, satellites_visible=0, time_week=0)
 ORIGIN = GeodeticPoint(48.0, -11.5, 500.0)
 BANKED = Attitude(0.4, -0.2, 2.5)
-
-
-def decoded(message: Any) -> Any:
-    return mavlink.MAVLink(None).decode(bytearray(packed(message, mavlink.MAVLink(None, 1, 197))))
 
 
 # --- ODOMETRY and VISION_POSITION_ESTIMATE ---

@@ -100,16 +100,6 @@ def test_fact_below_3d_nothing_reaches_the_ekf(fix_type: int) -> None:
     assert GpsInputDriver(0, 5.0).on_report(message(fix_type=fix_type), 0.0) is None
 
 
-def test_fact_an_ignored_velocity_stays_at_its_last_value() -> None:
-    driver = GpsInputDriver(0, 5.0)
-    never = driver.on_report(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.0)
-    driver.on_report(message(vn=5.0), 0.1)
-    stuck = driver.on_report(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.2)
-    assert never is not None
-    assert stuck is not None
-    assert (never.velocity_ned_mps[0], stuck.velocity_ned_mps[0]) == (0.0, 5.0)
-
-
 def test_fact_the_driver_assumes_a_delay_of_200_ms_unless_configured() -> None:
     for delay_ms, lag_s in ((0.0, 0.2), (5.0, 0.005), (100.0, 0.1), (900.0, 0.25)):
         fix = GpsInputDriver(0, delay_ms).on_report(message(), 10.0)

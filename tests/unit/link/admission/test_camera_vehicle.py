@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -136,25 +137,24 @@ def test_a_vehicle_that_was_not_confirmed_is_not_served_beside_a_second_one(rout
     assert router.sends(100 * S + 2 * MS) == 0
 
 
-@pytest.mark.parametrize("flies", [False, True])
-def test_a_vehicle_that_disappears_may_still_carry_the_camera_if_it_was_armed(router: Router, flies: bool) -> None:
+@pytest.mark.parametrize(
+    ("last", "silent_ns", "sent"),
+    [
+        pytest.param([heartbeat(), attitude(1000)], VEHICLE_CHANGE_TIMEOUT_NS, [0, 1], id="one that was not armed"),
+        pytest.param([armed(), attitude(1000)], VEHICLE_CHANGE_TIMEOUT_NS, [0, 0], id="one that was armed, for ever"),
+        pytest.param([armed()], HEARTBEATS_ONLY_NS, [0, 1], id="a single forged heartbeat, for five seconds only"),
+    ],
+)
+def test_a_vehicle_that_disappears_may_still_carry_the_camera_for_a_time(
+    router: Router, last: list[Any], silent_ns: int, sent: list[int]
+) -> None:
     router.receives(1 * S, armed(), attitude(1000))
-    router.receives(1 * S, armed() if flies else heartbeat(), attitude(1000), sysid=9)
-    sent = []
-    for at_ns in (S + VEHICLE_CHANGE_TIMEOUT_NS, S + VEHICLE_CHANGE_TIMEOUT_NS + MS):
+    router.receives(1 * S, *last, sysid=9)
+    found = []
+    for at_ns in (S + silent_ns, S + silent_ns + MS):
         router.receives(at_ns, armed(), attitude(at_ns // MS))
-        sent.append(router.sends(at_ns))
-    assert sent == [0, 0 if flies else 1]
-
-
-def test_a_single_forged_heartbeat_silences_for_five_seconds_only(router: Router) -> None:
-    router.receives(1 * S, armed(), attitude(1000))
-    router.receives(2 * S, armed(), sysid=9)
-    sent = []
-    for at_ns in (2 * S + HEARTBEATS_ONLY_NS, 2 * S + HEARTBEATS_ONLY_NS + MS):
-        router.receives(at_ns, armed(), attitude(at_ns // MS))
-        sent.append(router.sends(at_ns))
-    assert sent == [0, 1]
+        found.append(router.sends(at_ns))
+    assert found == sent
 
 
 def test_a_vehicle_that_follows_a_confirmed_one_must_be_confirmed_itself(router: Router) -> None:

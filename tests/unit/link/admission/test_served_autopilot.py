@@ -137,6 +137,8 @@ def test_autopilot_sysid_selects_the_receiver_of_the_position_on_a_wire() -> Non
         link.receives(sysid * S, heartbeat(), sysid=sysid)
         link.edge.on_message(GPS)
         assert len(link.wire.take("GPS_INPUT")) == positions
+        assert link.status().connected == (sysid == 9) != ("has system id 7, not 9" in link.status().detail)
+    assert link.status().sysid == 9
 
 
 def test_a_point_to_point_link_sends_the_position_before_any_reception() -> None:
@@ -164,30 +166,26 @@ def test_the_same_vehicle_is_served_at_a_new_address_after_three_seconds_of_sile
     assert ours.received("GPS_INPUT") == []
 
 
-@pytest.mark.parametrize("flies", [False, True])
-def test_another_vehicle_is_served_after_30_s_of_silence_unless_the_first_was_armed(
-    port: Port, ours: Speaker, theirs: Speaker, flies: bool
+@pytest.mark.parametrize(
+    ("last", "silent_ns", "positions"),
+    [
+        pytest.param([heartbeat(), attitude(1000)], VEHICLE_CHANGE_TIMEOUT_NS, [0, 1], id="30 s of one not armed"),
+        pytest.param([armed(), attitude(1000)], VEHICLE_CHANGE_TIMEOUT_NS, [0, 0], id="never after one in flight"),
+        pytest.param([armed()], HEARTBEATS_ONLY_NS, [0, 1], id="5 s of one that sent heartbeats only"),
+    ],
+)
+def test_another_vehicle_is_served_after_a_silence(
+    port: Port, ours: Speaker, theirs: Speaker, last: list[object], silent_ns: int, positions: list[int]
 ) -> None:
-    port.receives(1 * S, ours, armed() if flies else heartbeat(), attitude(1000))
-    positions = []
-    for at_ns in (1 * S + VEHICLE_CHANGE_TIMEOUT_NS - MS, 1 * S + VEHICLE_CHANGE_TIMEOUT_NS + MS):
-        port.receives(at_ns, theirs, heartbeat())
+    port.receives(1 * S, ours, *last)
+    found = []
+    for at_ns in (1 * S + silent_ns - MS, 1 * S + silent_ns + MS):
+        port.receives(at_ns, theirs, armed())
         port.edge.on_message(GPS)
-        positions.append(len(theirs.received("GPS_INPUT")))
-    assert positions == [0, 0 if flies else 1]
-
-
-def test_another_vehicle_is_served_after_5_s_of_silence_of_one_that_sent_heartbeats_only(
-    port: Port, ours: Speaker, theirs: Speaker
-) -> None:
-    port.receives(1 * S, theirs, armed())
-    positions = []
-    for at_ns in (1 * S + HEARTBEATS_ONLY_NS - MS, 1 * S + HEARTBEATS_ONLY_NS + MS):
-        port.receives(at_ns, ours, armed())
-        port.edge.on_message(GPS)
-        positions.append(len(ours.received("GPS_INPUT")))
-    assert positions == [0, 1]
-    assert port.texts() == ["Terrafix: no fix: camera on vehicle 7, 9?", "Terrafix: vehicle 7 is served, 9 is not"]
+        found.append(len(theirs.received("GPS_INPUT")))
+    assert found == positions
+    change = ["Terrafix: vehicle 9 is served, 7 is not"] if positions[1] else []
+    assert [text for text in port.texts() if "served" in text] == change
 
 
 @pytest.mark.parametrize(("first", "other", "changes"), [("heartbeats", "all", True), ("all", "all", False)])

@@ -56,34 +56,48 @@ class Vehicle:
         return states(published)[-1].agl_m
 
 
-def test_an_ekf_height_displaced_by_our_velocity_does_not_change_the_height() -> None:
+GROUND = [(0.0, 0.0, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("on_ground", "flight"),
+    [
+        pytest.param(
+            [(0.0, 0.0, 10.0)],
+            [(50.0 + ekf_error_m, 50.0, 1.0, 50.0) for ekf_error_m in range(20)],
+            id="an EKF height that our velocity displaces does not change it",
+        ),
+        pytest.param(
+            GROUND,
+            [(60.0, 50.0, 1.0, 50.0), (60.0, None, 2.0, 60.0), (60.0, 50.0, 1.0, 50.0)],
+            id="without pressure it is the EKF's",
+        ),
+        pytest.param(
+            GROUND,
+            [(50.0, 50.0, 1.0, 50.0), (None, 60.0, 3.0, 60.0)],
+            id="without EKF heights it continues by pressure",
+        ),
+        pytest.param(
+            [*GROUND, (0.0, 8.0, 60.0)],  # the pressure has fallen by 1 hPa
+            [(50.0, 58.0, 1.0, 50.0)],
+            id="on the ground the zero follows the air pressure",
+        ),
+        pytest.param(
+            [],
+            [(53.0, 50.0, 1.0, 53.0), (80.0, 60.0, 1.0, 63.0)],
+            id="a link that starts in the air takes the zero from the EKF once",
+        ),
+    ],
+)
+def test_the_height_is_that_above_take_off_by_pressure(
+    on_ground: list[tuple[float, float, float]], flight: list[tuple[float | None, float | None, float, float]]
+) -> None:
+    """Steps: height of the EKF, height by pressure [m], duration [s], and in flight the published height."""
     vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, flies=False, seconds=10.0)
-    assert vehicle.receive(50.0, 50.0) == pytest.approx(50.0, abs=0.1)
-    for ekf_error_m in range(1, 20):
-        assert vehicle.receive(50.0 + ekf_error_m, 50.0) == pytest.approx(50.0, abs=0.1)
-
-
-def test_without_pressure_the_height_is_the_ekf_height() -> None:
-    vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, flies=False)
-    assert vehicle.receive(60.0, 50.0) == pytest.approx(50.0, abs=0.1)
-    assert vehicle.receive(60.0, None, seconds=2.0) == 60.0
-    assert vehicle.receive(60.0, 50.0) == pytest.approx(50.0, abs=0.1)
-
-
-def test_without_ekf_heights_the_height_continues_by_pressure() -> None:
-    vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, flies=False)
-    vehicle.receive(50.0, 50.0)
-    assert vehicle.receive(None, 60.0, seconds=3.0) == pytest.approx(60.0, abs=0.1)
-
-
-def test_on_the_ground_the_zero_follows_the_air_pressure() -> None:
-    vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, flies=False)
-    vehicle.receive(0.0, 8.0, flies=False, seconds=60.0)  # the pressure has fallen by 1 hPa
-    assert vehicle.receive(50.0, 58.0) == pytest.approx(50.0, abs=0.1)
+    for ekf_m, above_m, seconds in on_ground:
+        vehicle.receive(ekf_m, above_m, flies=False, seconds=seconds)
+    for ekf, above, seconds, height_m in flight:
+        assert vehicle.receive(ekf, above, seconds=seconds) == pytest.approx(height_m, abs=0.1)
 
 
 def test_one_bad_reading_on_the_ground_changes_the_zero_by_a_tenth() -> None:
@@ -93,12 +107,6 @@ def test_one_bad_reading_on_the_ground_changes_the_zero_by_a_tenth() -> None:
         height.align_zero(0.0, False, i * 200 * MS)
     height.on_pressure(pressure_at(50.0), 21 * S)
     assert height.height_m(21 * S) == pytest.approx(48.0, abs=0.1)  # a tenth of it
-
-
-def test_a_link_started_in_the_air_takes_the_zero_from_the_ekf_once() -> None:
-    vehicle = Vehicle()
-    assert vehicle.receive(53.0, 50.0) == pytest.approx(53.0, abs=0.1)
-    assert vehicle.receive(80.0, 60.0) == pytest.approx(63.0, abs=0.1)
 
 
 def test_a_rebooted_autopilot_gets_a_new_zero() -> None:

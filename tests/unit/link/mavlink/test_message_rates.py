@@ -113,15 +113,6 @@ def test_two_autopilots_are_reported_and_the_confirmed_one_is_served() -> None:
     assert "more than one autopilot: 7 is served, 9 is not" in link.status().detail
 
 
-def test_the_autopilot_named_in_the_configuration_is_served() -> None:
-    link = WiredEdge(autopilot_sysid=9)
-    link.receives(0, heartbeat())
-    assert not link.status().connected
-    assert "has system id 7, not 9" in link.status().detail
-    link.receives(S, heartbeat(), sysid=9)
-    assert link.status().sysid == 9
-
-
 GCS = {(255, 190): mavlink.MAV_AUTOPILOT_INVALID}
 OTHER = {(4, 1): mavlink.MAV_AUTOPILOT_PX4}
 

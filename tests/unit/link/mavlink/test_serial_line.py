@@ -8,9 +8,8 @@ import time
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_rig import MS, TICK_NS, S, estimate, fly
+from link_rig import MS, TICK_NS, S, estimate
 from link_wire import WiredEdge, attitude, heartbeat, packed, states
-from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import open_edge
 from terrafix.link.mavlink.bandwidth import MIN_RATE_HZ, USABLE_SHARE_IN, LinkBandwidth
@@ -179,9 +178,3 @@ def test_measurement_times_are_correct_when_the_boot_time_wraps(days: float) -> 
 def test_after_an_autopilot_reboot_measurements_have_their_arrival_time() -> None:
     (state,) = states(synced_edge(1000 * S).receives(21 * S, heartbeat(), attitude(500)))
     assert state.t_ns == 21 * S
-
-
-def test_gps_input_does_not_depend_on_the_autopilots_clock() -> None:
-    """So a reboot of the autopilot does not affect it."""
-    published = fly(LinkNode(10.0), 0, 10 * S, lambda now: [estimate(now - 100 * MS)] if now % (400 * MS) == 0 else [])
-    assert sum(isinstance(x, m.GpsInput) for x in published) == 100
