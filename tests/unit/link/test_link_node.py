@@ -115,23 +115,17 @@ def test_a_stale_estimate_gives_fix_type_1_then_silence_and_recovers_immediately
     assert any("GPS_INPUT stopped" in t for t in texts(published))
 
 
-@pytest.mark.parametrize(("sigma_m", "fix_type"), [(4.0, 3), (35.0, 3), (60.0, 1), (1e6, 1)])
-def test_covariance_decides_the_fix_type(sigma_m: float, fix_type: int) -> None:
-    published = fly(LinkNode(10.0), 0, 5 * S, every(200 * MS, lambda t: estimate(t, sigma_m=sigma_m)))
-    last = gps(published)[-1]
-    assert last.fix_type == fix_type
-    assert last.horiz_accuracy_m <= 100.0
-    if fix_type == 3:
-        assert last.horiz_accuracy_m >= sigma_m
-
-
-@pytest.mark.parametrize(("sigma_mps", "fix_type"), [(0.3, 3), (1.0, 3), (1.6, 1)])
-def test_speed_accuracy_above_1_5_lowers_the_fix(sigma_mps: float, fix_type: int) -> None:
-    feed = every(100 * MS, lambda t: estimate(t, velocity_sigma=sigma_mps))
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_mps", "fix_type"),
+    [(4.0, 0.5, 3), (35.0, 0.5, 3), (60.0, 0.5, 1), (1e6, 0.5, 1), (4.0, 0.3, 3), (4.0, 1.0, 3), (4.0, 1.6, 1)],
+)
+def test_the_accuracy_of_position_and_speed_decides_the_fix_type(
+    sigma_m: float, sigma_mps: float, fix_type: int
+) -> None:
+    feed = every(100 * MS, lambda t: estimate(t, sigma_m=sigma_m, velocity_sigma=sigma_mps))
     last = gps(fly(LinkNode(10.0), 0, 5 * S, feed))[-1]
-    assert last.fix_type == fix_type
-    if fix_type == 3:
-        assert sigma_mps <= last.speed_accuracy_mps < 1.5
+    assert last.fix_type == fix_type and last.horiz_accuracy_m <= 100.0
+    assert fix_type == 1 or (last.horiz_accuracy_m >= sigma_m and sigma_mps <= last.speed_accuracy_mps < 1.5)
 
 
 def test_the_fix_type_has_hysteresis_at_the_accuracy_limit() -> None:

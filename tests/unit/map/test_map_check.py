@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import map_rasters
+from map_packages import centre_of
 from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
@@ -50,8 +51,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def opened_with_frame(path: Path) -> tuple[MapPackage, LocalFrame]:
     opened = MapPackage.open(path)
-    west, south, east, north = opened.manifest.bounds_wgs84
-    return opened, LocalFrame((south + north) / 2, (west + east) / 2)
+    return opened, centre_of(opened)
 
 
 def mission_over(folder: Path, frame: LocalFrame, *places_m: tuple[float, float]) -> Path:

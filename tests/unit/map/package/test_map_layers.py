@@ -23,9 +23,7 @@ LAT_DEG, LON_DEG = 23.4986, 121.0426
 
 def placed(path: Path, seed: int, crs: str, pixel: float, side_px: int) -> Path:
     """A texture around the same WGS84 position."""
-    x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(LON_DEG, LAT_DEG)
-    corner = Affine(pixel, 0, x - side_px * pixel / 2, 0, -pixel, y + side_px * pixel / 2)
-    return map_rasters.write_tif(path, map_rasters.texture(side_px, side_px, seed), crs, corner)
+    return map_rasters.around(path, map_rasters.texture(side_px, side_px, seed), crs, (LAT_DEG, LON_DEG), pixel)
 
 
 @pytest.fixture(scope="module")
