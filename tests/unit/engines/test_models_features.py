@@ -26,7 +26,8 @@ from terrafix_engines.runtime import ModelRunError
 from terrafix_engines.store import StoredModel, stored_model
 from textured_ground import texture
 
-DETECTOR = """name = "points"
+DETECTOR = tiny_onnx.described(
+    """name = "points"
 title = "an export of points"
 role = "keypoints"
 licence = "CC0"
@@ -40,20 +41,12 @@ scores = "scores"
 descriptors = "desc"
 coordinates = "signed"
 channels_first = true
-[[inputs]]
-name = "image"
-shape = [1, 1, "height", "width"]
-[[outputs]]
-name = "kpts"
-shape = [1, "points", 2]
-[[outputs]]
-name = "scores"
-shape = [1, "points"]
-[[outputs]]
-name = "desc"
-shape = [1, 4, "points"]
-"""
-MATCHER = """name = "glue"
+""",
+    {"image": [1, 1, "height", "width"]},
+    {"kpts": [1, "points", 2], "scores": [1, "points"], "desc": [1, 4, "points"]},
+)
+MATCHER = tiny_onnx.described(
+    """name = "glue"
 title = "an export of a matcher"
 role = "matcher"
 licence = "CC0"
@@ -64,26 +57,11 @@ descriptors = ["d0", "d1"]
 matches = "m"
 scores = "s"
 form = "index"
-[[inputs]]
-name = "k0"
-shape = [1, "points0", 2]
-[[inputs]]
-name = "k1"
-shape = [1, "points1", 2]
-[[inputs]]
-name = "d0"
-shape = [1, "points0", 4]
-[[inputs]]
-name = "d1"
-shape = [1, "points1", 4]
-[[outputs]]
-name = "m"
-shape = [1, "matches"]
-dtype = "int64"
-[[outputs]]
-name = "s"
-shape = [1, "matches"]
-"""
+""",
+    {"k0": [1, "points0", 2], "k1": [1, "points1", 2], "d0": [1, "points0", 4], "d1": [1, "points1", 4]},
+    {"m": [1, "matches"], "s": [1, "matches"]},
+    {"m": "int64"},
+)
 DataSet = Callable[[str], Path]
 
 

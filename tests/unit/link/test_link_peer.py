@@ -18,12 +18,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gps_messages import GPS
-from link_rig import ALT, LAT, LON, MS, SPEED_EAST, S, covariance, estimate, every, fly, gps, live
+from link_rig import ALT, MS, SPEED_EAST, S, estimate, every, fly, gps, live
+from live_flight import LiveFlight, eastward
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError, SourceError
 from terrafix.link.edge import open_edge
-from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.mavlink.message_rates import STREAMS_HZ
 from terrafix.link.node import LinkNode
 from terrafix.link.output import gps_input
@@ -205,35 +205,10 @@ def test_fact_no_single_report_has_a_bad_accuracy() -> None:
 # --- end to end ---
 
 
-def course(t_s: float) -> PeerState:
-    lat, lon = offset(LAT, LON, SPEED_EAST * t_s, 0.0)
-    return PeerState(lat, lon, ALT, 120.0, math.pi / 2, 0.02, 0.0, 0.0, SPEED_EAST, 0.0)
-
-
-class Flight:
-    """Clock and estimates for link and simulated autopilot: 4 Hz, 150 ms late, with an error ``east_m``."""
-
-    def __init__(self) -> None:
-        self.zero_ns = time.monotonic_ns()
-        self._next_ns = 0
-        self.east_m = 0.0
-
-    def clock(self) -> float:
-        return (time.monotonic_ns() - self.zero_ns) * 1e-9
-
-    def feed(self, now_ns: int) -> list[m.Message]:
-        if now_ns < self._next_ns:
-            return []
-        self._next_ns = now_ns + 250 * MS
-        at_ns = now_ns - 150 * MS
-        late = estimate(at_ns - self.zero_ns, east_m=self.east_m, cov=covariance(3.0))
-        return [msgspec.structs.replace(late, t_ns=at_ns, emitted_at_ns=now_ns)]
-
-
 @pytest.mark.slow
 def test_the_simulated_autopilot_navigates_on_the_gps_input_of_the_link(tmp_path: Path) -> None:
-    flight, peer = Flight(), AutopilotPeer(seed=3)
-    port = peer.start(0, course, flight.clock)
+    flight, peer = LiveFlight(), AutopilotPeer(seed=3)
+    port = peer.start(0, eastward, flight.clock)
     edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{port}"))
     published = live(LinkNode(10.0), edge, 3.0, flight.feed)
     report = peer.stop()
@@ -266,8 +241,8 @@ def test_the_simulated_autopilot_navigates_on_the_gps_input_of_the_link(tmp_path
 @pytest.mark.slow
 def test_gps_input_keeps_its_interval_for_20_s_with_one_wrong_estimate(stall_ms: Callable[[], float]) -> None:
     """AC-14 and AC-3, with the scheduling delay of this machine added."""
-    flight, peer = Flight(), AutopilotPeer(seed=4)
-    edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{peer.start(0, course, flight.clock)}"))
+    flight, peer = LiveFlight(), AutopilotPeer(seed=4)
+    edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{peer.start(0, eastward, flight.clock)}"))
     node = LinkNode(10.0)
 
     def feed(now_ns: int) -> list[m.Message]:
@@ -292,7 +267,7 @@ def test_gps_input_keeps_its_interval_for_20_s_with_one_wrong_estimate(stall_ms:
 
 def test_the_simulated_autopilot_answers_parameters_and_rejects_other_commands() -> None:
     peer = AutopilotPeer()
-    port = peer.start(0, course)
+    port = peer.start(0, eastward)
     wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     wire.settimeout(2.0)
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
@@ -318,11 +293,11 @@ def test_a_used_port_of_the_simulated_autopilot_raises_one_line() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         with pytest.raises(LinkError, match="cannot be used"):
-            AutopilotPeer().start(taken.getsockname()[1], course)
+            AutopilotPeer().start(taken.getsockname()[1], eastward)
 
 
 def test_the_simulated_autopilot_runs_in_its_own_process(tmp_path: Path) -> None:
-    write_course(tmp_path / "course.csv", [(t / 2, course(t / 2)) for t in range(60)])
+    write_course(tmp_path / "course.csv", [(t / 2, eastward(t / 2)) for t in range(60)])
     out = tmp_path / "peer.json"
     zero_ns = time.monotonic_ns()
     options = ["--port", "0", "--out", str(out), "--start-ns", str(zero_ns)]
@@ -330,8 +305,7 @@ def test_the_simulated_autopilot_runs_in_its_own_process(tmp_path: Path) -> None
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         port = int(process.stdout.readline().rsplit(":", 1)[1])
-        flight = Flight()
-        flight.zero_ns = zero_ns
+        flight = LiveFlight(zero_ns)
         edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{port}"))
         live(LinkNode(10.0), edge, 1.5, flight.feed)
         os.kill(process.pid, signal.SIGTERM)

@@ -181,68 +181,59 @@ def test_the_firmware_version_comes_from_autopilot_version(monkeypatch: pytest.M
     assert firmwares == [(4, 6), (4, 7)]
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "status", "says"),
-    [
-        ("GPS1_TYPE", 1, "fail", "set 14"),
-        ("GPS1_DELAY_MS", 0, "fail", "200 ms"),
-        ("GPS1_DELAY_MS", 220, "fail", "moment of sending"),
-        ("EK3_GPS_CHECK", 31, "fail", "set 23"),
-        ("EK3_VELNE_M_NSE", 0.3, "fail", "failsafe"),
-        ("EK3_VELNE_M_NSE", 1.5, "fail", "does not align"),
-        ("EK3_SRC1_VELXY", 0, "fail", "velocity is sent"),
-        ("EK3_SRC1_POSZ", 3, "warn", "barometer"),
-        ("EK3_SRC1_YAW", 2, "fail", "no yaw"),
-        ("AHRS_OPTIONS", 2, "warn", "set 3"),
-        ("ARSPD_USE", 0, "warn", "170 m"),
-        ("EK3_CHECK_SCALE", 50, "warn", "set 100"),
-        ("EK3_SRC1_VELZ", 0, "warn", "set 3"),
-        ("EK3_POSNE_M_NSE", 5.0, "warn", "set 0.5"),
-        ("EK3_GLITCH_RAD", 0, "warn", "clipped"),
-        ("GPS1_POS_X", 0.4, "warn", "antenna"),
-        ("GPS2_TYPE", 14, "fail", "both GPS"),
-    ],
-)
-def test_each_wrong_value_has_a_reason_and_a_fix(name: str, value: float, status: str, says: str) -> None:
-    line = lines_by_check(DEFAULTS | preset("plane") | {name: value}, context())[name]
+WRONG = [
+    ("plane", {"GPS1_TYPE": 1}, "GPS1_TYPE", "fail", "set 14"),
+    ("plane", {"GPS1_DELAY_MS": 0}, "GPS1_DELAY_MS", "fail", "200 ms"),
+    ("plane", {"GPS1_DELAY_MS": 220}, "GPS1_DELAY_MS", "fail", "moment of sending"),
+    ("plane", {"EK3_GPS_CHECK": 31}, "EK3_GPS_CHECK", "fail", "set 23"),
+    ("plane", {"EK3_VELNE_M_NSE": 0.3}, "EK3_VELNE_M_NSE", "fail", "failsafe"),
+    ("plane", {"EK3_VELNE_M_NSE": 1.5}, "EK3_VELNE_M_NSE", "fail", "does not align"),
+    ("plane", {"EK3_SRC1_VELXY": 0}, "EK3_SRC1_VELXY", "fail", "velocity is sent"),
+    ("plane", {"EK3_SRC1_POSZ": 3}, "EK3_SRC1_POSZ", "warn", "barometer"),
+    ("plane", {"EK3_SRC1_YAW": 2}, "EK3_SRC1_YAW", "fail", "no yaw"),
+    ("plane", {"AHRS_OPTIONS": 2}, "AHRS_OPTIONS", "warn", "set 3"),
+    ("plane", {"ARSPD_USE": 0}, "ARSPD_USE", "warn", "170 m"),
+    ("plane", {"EK3_CHECK_SCALE": 50}, "EK3_CHECK_SCALE", "warn", "set 100"),
+    ("plane", {"EK3_SRC1_VELZ": 0}, "EK3_SRC1_VELZ", "warn", "set 3"),
+    ("plane", {"EK3_POSNE_M_NSE": 5.0}, "EK3_POSNE_M_NSE", "warn", "set 0.5"),
+    ("plane", {"EK3_GLITCH_RAD": 0}, "EK3_GLITCH_RAD", "warn", "clipped"),
+    ("plane", {"GPS1_POS_X": 0.4}, "GPS1_POS_X", "warn", "antenna"),
+    ("plane", {"GPS2_TYPE": 14}, "GPS2_TYPE", "fail", "both GPS"),
+    ("plane", {"EK3_SRC2_VELXY": 6}, "EK3_SRC_OPTIONS", "warn", "set 0"),  # another source set has a velocity
+    ("copter", {"FS_EKF_ACTION": 0}, "FS_EKF_ACTION", "warn", "drifts on"),
+    ("second-gps", {"GPS_AUTO_SWITCH": 2}, "GPS_AUTO_SWITCH", "warn", "set 4"),  # it blends both
+    ("second-gps", {"GPS_AUTO_SWITCH": 0}, "GPS_AUTO_SWITCH", "warn", "set 4"),  # left by a flight on Terrafix
+    ("second-gps", {"GPS_PRIMARY": 1}, "GPS_PRIMARY", "warn", "set 0"),
+    ("second-gps", {"ARMING_CHECK": 1}, "ARMING_CHECK", "warn", ""),
+]
+
+
+@pytest.mark.parametrize(("name", "changed", "check", "status", "says"), WRONG)
+def test_each_wrong_value_has_a_reason_and_a_fix(
+    name: str, changed: dict[str, float], check: str, status: str, says: str
+) -> None:
+    at = context(plane=name != "copter", gps_id=int(name == "second-gps"))
+    line = lines_by_check(DEFAULTS | preset(name) | changed, at)[check]
     assert line.status == status
     assert says in f"{line.text} {line.fix}"
     assert (line.change is not None) or not line.fix
 
 
+@pytest.mark.parametrize(
+    ("name", "check"),
+    [
+        pytest.param("plane", "FS_EKF_ACTION", id="only a copter has a failsafe action"),
+        pytest.param("plane", "EK3_SRC_OPTIONS", id="no other source set has a velocity"),
+        pytest.param("plane", "GPS_AUTO_SWITCH", id="there is no other receiver"),
+    ],
+)
+def test_a_rule_that_does_not_apply_has_no_line(name: str, check: str) -> None:
+    assert check not in lines_by_check(DEFAULTS | preset(name), context())
+
+
 @pytest.mark.parametrize(("value", "text"), [(1048566.0, "1048566"), (0.8999999761581421, "0.9"), (-1.0, "-1")])
 def test_parameter_values_are_formatted_without_loss(value: float, text: str) -> None:
     assert number(value) == text
-
-
-def test_a_blending_switch_with_a_real_receiver_is_a_warning() -> None:
-    values = DEFAULTS | preset("second-gps") | {"GPS_AUTO_SWITCH": 2, "ARMING_CHECK": 1}
-    lines = lines_by_check(values, context(gps_id=1))
-    assert (lines["GPS_AUTO_SWITCH"].status, lines["ARMING_CHECK"].status) == ("warn", "warn")
-    assert "GPS_PRIMARY" in lines
-    assert "GPS_AUTO_SWITCH" not in lines_by_check(DEFAULTS, context())  # not relevant without another receiver
-
-
-def test_only_a_copter_has_a_failsafe_action() -> None:
-    values = DEFAULTS | preset("copter") | {"FS_EKF_ACTION": 0}
-    assert "drifts on" in lines_by_check(values, context(plane=False))["FS_EKF_ACTION"].text
-    assert "FS_EKF_ACTION" not in lines_by_check(values, context(plane=True))
-
-
-def test_fusing_all_velocities_is_a_warning_where_another_source_set_has_one() -> None:
-    assert "EK3_SRC_OPTIONS" not in lines_by_check(DEFAULTS | preset("plane"), context())
-    values = DEFAULTS | preset("plane") | {"EK3_SRC2_VELXY": 6}
-    assert lines_by_check(values, context())["EK3_SRC_OPTIONS"].fix == "set 0"
-
-
-@pytest.mark.parametrize(
-    ("values", "name"),
-    [({"GPS_AUTO_SWITCH": 0}, "GPS_AUTO_SWITCH"), ({"GPS_PRIMARY": 1}, "GPS_PRIMARY")],
-)
-def test_what_a_flight_on_terrafix_leaves_is_a_warning(values: dict[str, float], name: str) -> None:
-    line = lines_by_check(DEFAULTS | preset("second-gps") | values, context(gps_id=1))[name]
-    assert line.status == "warn"
-    assert line.change is not None and line.change.new == preset("second-gps")[name]
 
 
 def test_local_frame_outputs_have_their_own_rules() -> None:
