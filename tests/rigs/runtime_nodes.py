@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from origins import origin_of
 from terrafix import messages as m
 from terrafix.core.codec import encode_json
 from terrafix.core.errors import LinkError
@@ -17,18 +18,27 @@ from terrafix.core.node import Edge, Node, NodeContext
 from terrafix.processes import ALL_MESSAGES, Process
 
 CAMERA = m.Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
-ORIGIN = m.Origin(
-    t_ns=0,
-    camera=CAMERA,
-    lat_deg=48.0,
-    lon_deg=11.0,
-    ground_amsl_m=500.0,
-    start_sigma_m=10.0,
-    yaw_sigma_deg=3.0,
-    agl_sigma_m=2.0,
-    attitude_sigma_deg=2.0,
-)
+ORIGIN = origin_of(CAMERA)
 FRAME_PERIOD_NS = 20_000_000
+
+
+def frame(frame_id: int) -> m.Frame:
+    return m.Frame(t_ns=frame_id, frame_id=frame_id, file="", width=1, height=1)
+
+
+def prediction(frame_id: int, east_m: float, north_m: float) -> m.Prediction:
+    """``east_m``, ``north_m``: motion since the frame before."""
+    return m.Prediction(
+        t_ns=frame_id,
+        frame_id=frame_id,
+        p_c_in_w_m=(0.0, 0.0, 100.0),
+        q_w_c=(1.0, 0.0, 0.0, 0.0),
+        cov=(1.0,) * 36,
+        agl_m=100.0,
+        agl_sigma_m=2.0,
+        step_m=(east_m, north_m),
+        step_cov_m2=(1.0, 0.5, 0.5, 2.0),
+    )
 
 
 def image_of(frame_id: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 """ONNX files of a few nodes, so that tests need no real weights."""
 
 import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,18 @@ def constants(inputs: dict[str, tuple[Shape, str]], outputs: dict[str, np.ndarra
     )
 
 
+def described(
+    head: str, inputs: dict[str, Shape], outputs: dict[str, Shape], dtypes: dict[str, str] | None = None
+) -> str:
+    """-> a manifest: ``head`` and the tensors; ``dtypes``: of those that are not float32."""
+    text = head
+    for kind, tensors in (("inputs", inputs), ("outputs", outputs)):
+        for name, shape in tensors.items():
+            text += f'[[{kind}]]\nname = "{name}"\nshape = {json.dumps(shape)}\n'
+            text += f'dtype = "{dtypes[name]}"\n' if dtypes and name in dtypes else ""
+    return text
+
+
 def write(folder: Path, manifest: str, content: bytes) -> Path:
     """Writes the model NAME.onnx and its manifest with file, sha256 and size. -> path of the model."""
     name = next(line.split('"')[1] for line in manifest.splitlines() if line.startswith("name = "))
@@ -91,7 +104,9 @@ def write(folder: Path, manifest: str, content: bytes) -> Path:
     return path
 
 
-XFEAT_LIKE = """name = "tiny"
+XFEAT_LIKE = (
+    described(
+        """name = "tiny"
 title = "tensors of XFeat"
 role = "dense"
 licence = "CC0"
@@ -99,20 +114,53 @@ licence = "CC0"
 input = "input"
 colour = "rgb"
 multiple = 8
-[[inputs]]
-name = "input"
-shape = ["batch", 3, "height", "width"]
-[[outputs]]
-name = "descriptors"
-shape = ["batch", 64, "height/8", "width/8"]
-[[outputs]]
-name = "keypoint_logits"
-shape = ["batch", 65, "height/8", "width/8"]
-[[outputs]]
-name = "reliability"
-shape = ["batch", 1, "height/8", "width/8"]
-[[presets]]
+""",
+        {"input": ["batch", 3, "height", "width"]},
+        {
+            "descriptors": ["batch", 64, "height/8", "width/8"],
+            "keypoint_logits": ["batch", 65, "height/8", "width/8"],
+            "reliability": ["batch", 1, "height/8", "width/8"],
+        },
+    )
+    + """[[presets]]
 sizes = { batch = 1, height = 32, width = 64 }
 [[presets]]
 sizes = { batch = 1, height = 64, width = 64 }
 """
+)
+GLOBAL = described(
+    """name = "means"
+title = "mean colours of a grid"
+role = "global"
+licence = "CC0"
+[image]
+input = "image"
+colour = "rgb"
+multiple = 14
+mean = [0.485, 0.456, 0.406]
+std = [0.229, 0.224, 0.225]
+[vector]
+output = "vector"
+size = 12
+side_px = 28
+""",
+    {"image": [1, 3, 28, 28]},
+    {"vector": [1, 12]},
+)
+PAIR = described(
+    """name = "both"
+title = "an export that is given two pictures"
+role = "pair"
+licence = "CC0"
+[image]
+input = "image0"
+colour = "gray"
+multiple = 8
+[pair]
+second = "image1"
+keypoints = ["mkpts0", "mkpts1"]
+scores = "mconf"
+""",
+    {"image0": [1, 1, "height", "width"], "image1": [1, 1, "height", "width"]},
+    {"mkpts0": ["pairs", 2], "mkpts1": ["pairs", 2], "mconf": ["pairs"]},
+)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from origins import origin_of
 from terrafix import messages as m
 from terrafix.core.config import Config
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
@@ -18,18 +19,7 @@ SIGMA_M = 4.0
 
 
 def origin() -> m.Origin:
-    camera = m.Camera(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
-    return m.Origin(
-        t_ns=0,
-        camera=camera,
-        lat_deg=48.0,
-        lon_deg=11.0,
-        ground_amsl_m=500.0,
-        start_sigma_m=10.0,
-        yaw_sigma_deg=3.0,
-        agl_sigma_m=3.0,
-        attitude_sigma_deg=2.0,
-    )
+    return origin_of(m.Camera(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0))
 
 
 def frame(i: int, file: str = "") -> m.Frame:

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_wire import heartbeat, packed
+from link_wire import PolledEdge, packed
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge, open_edge
@@ -16,7 +16,7 @@ ARRIVES_S = 0.005  # time for delivery over loopback
 
 
 class Speaker:
-    """One sender of MAVLink packets: a system and component with its own socket."""
+    """One sender of MAVLink packets: a system and component with a socket. ``peer``: who sent it the last packet."""
 
     def __init__(self, sysid: int, compid: int = 1, *, port: int = 0) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -24,6 +24,7 @@ class Speaker:
         self.socket.setblocking(False)
         self.address: tuple[str, int] = self.socket.getsockname()
         self.mav = mavlink.MAVLink(None, srcSystem=sysid, srcComponent=compid)
+        self.peer = self.address
         self._parser = mavlink.MAVLink(None)
 
     def __enter__(self) -> Self:
@@ -32,9 +33,9 @@ class Speaker:
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         self.socket.close()
 
-    def send(self, to: tuple[str, int], *messages: Any) -> None:
+    def send(self, *messages: Any, to: tuple[str, int] | None = None) -> None:
         for message in messages:
-            self.socket.sendto(packed(message, self.mav), to)
+            self.socket.sendto(packed(message, self.mav), to or self.peer)
 
     def received(self, kind: str = "") -> list[Any]:
         """-> messages received since the last call; only those of type ``kind``, if given."""
@@ -42,12 +43,17 @@ class Speaker:
         found = []
         while True:
             try:
-                found.append(self._parser.decode(bytearray(self.socket.recv(4096))))
+                packet, self.peer = self.socket.recvfrom(4096)
+                found.append(self._parser.decode(bytearray(packet)))
             except BlockingIOError:
                 return [x for x in found if not kind or x.get_type() == kind]
 
     def kinds(self) -> set[str]:
-        return {x.get_type() for x in self.received()}
+        return kinds(self.received())
+
+
+def kinds(messages: list[Any]) -> set[str]:
+    return {x.get_type() for x in messages}
 
 
 def free_port() -> int:
@@ -55,42 +61,23 @@ def free_port() -> int:
         return speaker.address[1]
 
 
-class Port:
-    """A listening edge. ``published``: all messages of its polls."""
+class Port(PolledEdge):
+    """A listening edge."""
 
     def __init__(self, edge: MavlinkEdge, address: tuple[str, int]) -> None:
-        self.edge, self.address = edge, address
-        self.published: list[m.Message] = []
+        super().__init__(edge)
+        self.address = address
 
     def receives(self, now_ns: int, speaker: Speaker, *messages: Any) -> list[m.Message]:
         """Sends the messages to the edge, and polls it."""
-        speaker.send(self.address, *messages)
+        speaker.send(*messages, to=self.address)
         return self.poll(now_ns)
 
     def poll(self, now_ns: int) -> list[m.Message]:
         time.sleep(ARRIVES_S)
-        published = list(self.edge.poll(now_ns))
-        self.published += published
-        return published
-
-    def detail(self) -> str:
-        """-> detail of the newest LinkStatus."""
-        return [x for x in self.published if isinstance(x, m.LinkStatus)][-1].detail
-
-    def texts(self) -> list[str]:
-        return [x.text for x in self.published if isinstance(x, m.StatusText)]
+        return super().poll(now_ns)
 
 
 def listening(**changes: Any) -> Port:
     port = free_port()
     return Port(open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}", **changes)), ("127.0.0.1", port))
-
-
-def armed() -> Any:
-    beat = heartbeat()
-    beat.base_mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-    return beat
-
-
-def station_heartbeat() -> Any:
-    return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3)

@@ -6,6 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+from pyproj import Transformer
 from rasterio.transform import Affine
 
 
@@ -43,6 +44,16 @@ def write_tif(path: Path, bands: np.ndarray, crs: str | None, transform: Affine 
         if palette is not None:
             file.write_colormap(1, palette)
     return path
+
+
+def around(
+    path: Path, bands: np.ndarray, crs: str, place_deg: tuple[float, float], pixel: float, **profile: Any
+) -> Path:
+    """Writes a GeoTIFF with its centre at ``place_deg``, latitude and longitude."""
+    x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(*place_deg[::-1])
+    height, width = bands.shape[1:]
+    corner = Affine(pixel, 0, x - width * pixel / 2, 0, -pixel, y + height * pixel / 2)
+    return write_tif(path, bands, crs, corner, **profile)
 
 
 def utm(path: Path, bands: np.ndarray, crs: str = "EPSG:32651", pixel_m: float = 0.5, **profile: Any) -> Path:

@@ -4,8 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from origins import origin_of
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.messages import Camera, Origin, Prediction
+from terrafix.messages import Camera, Prediction
 from textured_ground import PINHOLE, FlatMap, rotation
 
 AGL_M = 100.0
@@ -14,17 +15,8 @@ R = rotation(40.0)
 TRUE_M = np.array([20.0, -10.0, AGL_M])
 
 
-ORIGIN = Origin(
-    t_ns=0,
-    camera=Camera(width=640, height=360, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=319.5, cy=179.5),
-    lat_deg=48.0,
-    lon_deg=11.0,
-    ground_amsl_m=0.0,
-    start_sigma_m=10.0,
-    yaw_sigma_deg=2.0,
-    agl_sigma_m=2.0,
-    attitude_sigma_deg=1.0,
-)
+CAMERA = Camera(width=640, height=360, fx=PINHOLE.fx, fy=PINHOLE.fy, cx=319.5, cy=179.5)
+ORIGIN = origin_of(CAMERA, ground_amsl_m=0.0, yaw_sigma_deg=2.0, agl_sigma_m=2.0, attitude_sigma_deg=1.0)
 
 
 class SingleMapPackage(FlatMap):

@@ -8,6 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from link_rig import MS, S
+from link_wire import armed, attitude, decoded, packed, states
 from terrafix.core.mavlink.airspeed import UNHEALTHY, USED, AirspeedReader
 from terrafix.core.mavlink.tlog import read_tlog, record
 from terrafix.link.autopilot.telemetry import Telemetry
@@ -15,7 +16,6 @@ from terrafix.link.mavlink.timesync import TimeSync
 from terrafix.messages import VehicleState
 
 T0_US = 1_700_000_000_000_000
-HEARTBEAT = mavlink.MAVLink_heartbeat_message(1, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4, 3)
 VFR_HUD = mavlink.MAVLink_vfr_hud_message(31.0, 25.0, 90, 50, 100.0, 0.0)
 
 
@@ -23,22 +23,11 @@ def airspeed(mps: float, sensor: int = 0, flags: int = USED) -> Any:
     return mavlink.MAVLink_airspeed_message(sensor, mps, 1500, 200.0, flags)
 
 
-def attitude(boot_ms: int) -> Any:
-    return mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-
-
-def packed(message: Any) -> bytes:
-    return bytes(message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1)))
-
-
-def states(messages: list[tuple[int, Any]]) -> list[VehicleState]:
+def published(messages: list[tuple[int, Any]]) -> list[VehicleState]:
     """(arrival time, message) -> published vehicle states."""
     telemetry = Telemetry(TimeSync())
-    wire = [(0, HEARTBEAT), *messages]
-    messages_out = [
-        telemetry.on_message(mavlink.MAVLink(None).decode(bytearray(packed(m))), now_ns) for now_ns, m in wire
-    ]
-    return [state for state in messages_out if isinstance(state, VehicleState)]
+    answers = [telemetry.on_message(decoded(message), now_ns) for now_ns, message in [(0, armed()), *messages]]
+    return states(answer for answer in answers if answer is not None)
 
 
 def test_airspeed_flags_equal_those_of_the_mavlink_dialect() -> None:
@@ -69,13 +58,14 @@ def test_an_implausible_airspeed_is_rejected(mps: float) -> None:
 
 def test_the_link_publishes_fresh_sensor_airspeed_and_ignores_vfr_hud() -> None:
     moments = [(0, attitude(0)), (100 * MS, airspeed(21.0)), (200 * MS, VFR_HUD), (200 * MS, attitude(200))]
-    published = states([*moments, (2 * S, attitude(2000))])
-    assert [state.airspeed_mps for state in published] == [None, pytest.approx(21.0), None]
+    found = published([*moments, (2 * S, attitude(2000))])
+    assert [state.airspeed_mps for state in found] == [None, pytest.approx(21.0), None]
 
 
 def test_airspeed_is_read_from_a_telemetry_log(tmp_path: Path) -> None:
     log = tmp_path / "telemetry.tlog"
-    messages = [HEARTBEAT, attitude(0), airspeed(21.0), VFR_HUD, airspeed(21.5), attitude(100)]
-    log.write_bytes(b"".join(record(T0_US + 50_000 * i, packed(m)) for i, m in enumerate(messages)))
-    published = [(state.t_ns // MS, state.airspeed_mps) for state in read_tlog(log) if state.airspeed_mps is not None]
-    assert published == [(100, pytest.approx(21.0)), (200, pytest.approx(21.5))]
+    messages = [armed(), attitude(0), airspeed(21.0), VFR_HUD, airspeed(21.5), attitude(100)]
+    mav = mavlink.MAVLink(None, 1, 1)
+    log.write_bytes(b"".join(record(T0_US + 50_000 * i, packed(m, mav)) for i, m in enumerate(messages)))
+    found = [(state.t_ns // MS, state.airspeed_mps) for state in read_tlog(log) if state.airspeed_mps is not None]
+    assert found == [(100, pytest.approx(21.0)), (200, pytest.approx(21.5))]

@@ -7,12 +7,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gps_messages import NO_FIX, S
-from link_wire import MemoryWire, attitude, packed, states
-from terrafix.core.config import LinkSection
+from link_wire import WiredEdge, armed, attitude, packed, states
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
 from terrafix.core.mavlink.tlog import read_tlog, record
-from terrafix.link.autopilot.checkpoint import CheckpointWriter
-from terrafix.link.edge import MavlinkEdge
 
 GROUND_M, BOAT_M = 400.0, 365.0
 
@@ -52,31 +49,17 @@ def position(boot_ms: int, above_ground_m: float, home_m: float) -> mavlink.MAVL
     return mavlink.MAVLink_global_position_int_message(boot_ms, *place, 0, 0, 0, 0)
 
 
-def armed() -> mavlink.MAVLink_heartbeat_message:
-    kinds = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-    return mavlink.MAVLink_heartbeat_message(*kinds, mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 0, 0, 3)
-
-
 def test_a_restarted_link_keeps_the_height_above_take_off(tmp_path: Path) -> None:
-    mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+    def heights(link: WiredEdge, at_s: int, home_m: float) -> list[float | None]:
+        telemetry = (position(1000 * at_s, 50.0 + at_s, home_m), attitude(1000 * at_s))
+        return [state.agl_m for state in states(link.receives(at_s * S, *telemetry))]
 
-    def heights(edge: MavlinkEdge, wire: MemoryWire, at_s: int, home_m: float) -> list[float | None]:
-        wire.arrive(packed(position(1000 * at_s, 50.0 + at_s, home_m), mav), packed(attitude(1000 * at_s), mav))
-        return [state.agl_m for state in states(edge.poll(at_s * S))]
-
-    def link() -> tuple[MavlinkEdge, MemoryWire]:
-        wire = MemoryWire()
-        return MavlinkEdge(
-            LinkSection(), wire, lambda: 0, checkpoint_writer=CheckpointWriter(tmp_path / "link.checkpoint")
-        ), wire
-
-    edge, wire = link()
-    wire.arrive(packed(armed(), mav))
-    assert heights(edge, wire, 1, GROUND_M) == pytest.approx([51.0])
-    assert heights(edge, wire, 2, BOAT_M) == pytest.approx([52.0])
-    edge.on_message(NO_FIX)
-    edge, wire = link()
-    assert heights(edge, wire, 8, BOAT_M) == pytest.approx([58.0])
+    link = WiredEdge(checkpoint=tmp_path / "link.checkpoint")
+    link.receives(0, armed())
+    assert heights(link, 1, GROUND_M) == pytest.approx([51.0])
+    assert heights(link, 2, BOAT_M) == pytest.approx([52.0])
+    link.edge.on_message(NO_FIX)
+    assert heights(WiredEdge(checkpoint=tmp_path / "link.checkpoint"), 8, BOAT_M) == pytest.approx([58.0])
 
 
 def test_a_telemetry_log_gives_height_above_take_off_when_home_is_moved(tmp_path: Path) -> None:

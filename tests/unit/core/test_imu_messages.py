@@ -8,6 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from link_rig import MS, S
+from link_wire import armed, decoded
 from terrafix.core.mavlink.imu import boot_ns, imu_readings
 from terrafix.core.mavlink.tlog import read_imu, record
 from terrafix.link.autopilot.telemetry import Telemetry
@@ -31,34 +32,24 @@ def highres(boot_us: int) -> Any:
     return mavlink.MAVLink_highres_imu_message(boot_us, 1.5, -0.2, -9.8, 0.01, -0.02, 0.5, *(0.0,) * 7, 63)
 
 
-def heartbeat() -> Any:
-    return mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 128, 0, 4, 3)
-
-
-def sent(message: Any, sysid: int = 1, compid: int = 1) -> Any:
-    """The message after encoding and decoding."""
-    packed = message.pack(mavlink.MAVLink(None, srcSystem=sysid, srcComponent=compid))
-    return mavlink.MAVLink(None).decode(bytearray(packed))
-
-
 def published(messages: list[tuple[int, Any]]) -> list[Imu]:
     """(arrival time, message) -> published Imu messages."""
     telemetry = Telemetry(TimeSync())
-    telemetry.on_message(sent(heartbeat()), 0)
-    answers = [telemetry.on_message(sent(message), now_ns) for now_ns, message in messages]
+    telemetry.on_message(decoded(armed()), 0)
+    answers = [telemetry.on_message(decoded(message), now_ns) for now_ns, message in messages]
     return [a for a in answers if isinstance(a, Imu)]
 
 
 def test_imu_messages_are_converted_to_si_units() -> None:
     expected = (0.1 * G, -0.02 * G, -G, 0.01, -0.02, 0.5)
-    assert imu_readings(sent(raw(1000))) == pytest.approx(expected)
-    assert imu_readings(sent(scaled(1))) == pytest.approx((0.3 * G, *expected[1:]))
-    assert imu_readings(sent(scaled(1, second=True))) == pytest.approx((0.3 * G, *expected[1:]))
-    assert imu_readings(sent(highres(1000))) == pytest.approx((1.5, -0.2, -9.8, 0.01, -0.02, 0.5))
+    assert imu_readings(decoded(raw(1000))) == pytest.approx(expected)
+    assert imu_readings(decoded(scaled(1))) == pytest.approx((0.3 * G, *expected[1:]))
+    assert imu_readings(decoded(scaled(1, second=True))) == pytest.approx((0.3 * G, *expected[1:]))
+    assert imu_readings(decoded(highres(1000))) == pytest.approx((1.5, -0.2, -9.8, 0.01, -0.02, 0.5))
 
 
 def test_saturated_and_nan_imu_readings_are_rejected() -> None:
-    assert imu_readings(sent(raw(1000, forward_mg=32767))) is None  # saturated
+    assert imu_readings(decoded(raw(1000, forward_mg=32767))) is None  # saturated
     broken = highres(1000)
     broken.zacc = math.nan
     assert imu_readings(broken) is None
@@ -117,10 +108,10 @@ def test_the_selection_does_not_alternate_between_equally_fast_imu_streams() -> 
 
 def test_imu_messages_of_another_system_or_component_are_ignored() -> None:
     telemetry = Telemetry(TimeSync())
-    telemetry.on_message(sent(heartbeat()), 0)
+    telemetry.on_message(decoded(armed()), 0)
     for i in range(1, 20):
-        assert telemetry.on_message(sent(raw(0), sysid=9), i * 20 * MS) is None
-        assert telemetry.on_message(sent(raw(0), compid=154), i * 20 * MS) is None
+        assert telemetry.on_message(decoded(raw(0), sysid=9), i * 20 * MS) is None
+        assert telemetry.on_message(decoded(raw(0), compid=154), i * 20 * MS) is None
 
 
 # --- logs ---------------------------------------------------------------------------------------------------------
@@ -140,7 +131,7 @@ def times_s(imus: list[Imu]) -> list[float]:
 def test_a_log_gives_imu_samples_with_the_intervals_of_the_autopilot_clock(tmp_path: Path) -> None:
     """Arrival times have a jitter of up to 80 ms; the sampling interval is 20 ms."""
     late = [0.0, 0.03, 0.08, 0.01, 0.05]
-    records = [(0.0, heartbeat())]
+    records = [(0.0, armed())]
     records += [(0.5 + 0.02 * i + late[i % 5], raw(7_000_000 + 20_000 * i)) for i in range(100)]
     imus = read_imu(log(tmp_path / "a.tlog", records))
     assert times_s(imus) == pytest.approx([0.5 + 0.02 * i for i in range(100)], abs=1e-6)
@@ -157,4 +148,4 @@ def test_a_log_with_a_reboot_of_the_autopilot_gives_all_imu_samples(tmp_path: Pa
 
 
 def test_a_log_without_imu_messages_gives_no_samples(tmp_path: Path) -> None:
-    assert read_imu(log(tmp_path / "a.tlog", [(0.0, heartbeat())])) == []
+    assert read_imu(log(tmp_path / "a.tlog", [(0.0, armed())])) == []

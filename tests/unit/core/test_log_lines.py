@@ -5,8 +5,10 @@ import io
 import json
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from gps_messages import GPS
 from terrafix import messages as m
 from terrafix.core import codec, logs
 from terrafix.core.log_lines import LogEntry, MessageLog
@@ -28,44 +30,86 @@ def hint(verdict: m.Verdict) -> m.HintVerdict:
     return m.HintVerdict(t_ns=2, hint_t_ns=1, verdict=verdict, distance_m=12.0, sigma_m=3.0, text="hint: search there")
 
 
-@pytest.mark.parametrize(
-    ("step", "level"),
-    [
-        (m.SearchStep.NORMAL, "debug"),
-        (m.SearchStep.SKIP, "debug"),
-        (m.SearchStep.NEW_FRAGMENT, "info"),
-        (m.SearchStep.MERGE, "info"),
-        (m.SearchStep.WIDEN, "warning"),
-        (m.SearchStep.WHOLE_MAP, "warning"),
-        (m.SearchStep.ASK, "warning"),
-    ],
-)
-def test_each_step_of_the_search_is_logged_by_its_name(step: m.SearchStep, level: str) -> None:
-    entry = log_entry(m.SearchState(t_ns=1, step=step))
-    assert entry is not None
-    assert (entry.level, entry.event, entry.fields) == (level, "search step", {"step": step.value})
+def rejected(frame_id: int, measurement: str, verdict: m.Verdict, detail: str = "") -> m.MeasurementVerdict:
+    return m.MeasurementVerdict(t_ns=7, frame_id=frame_id, measurement=measurement, verdict=verdict, detail=detail)
 
 
-@pytest.mark.parametrize(
-    ("message", "level", "event"),
-    [
-        (m.StatusText(t_ns=1, severity=4, text="lost, send a position hint"), "warning", "text to the pilot"),
-        (m.StatusText(t_ns=1, severity=5, text="computer is hot"), "info", "text to the pilot"),
-        (hint(m.Verdict.ACCEPTED), "info", "position hint"),
-        (hint(m.Verdict.OUTSIDE_MAP), "warning", "position hint"),
-        (fault(active=True), "warning", "calibration fault"),
-        (fault(active=False), "info", "calibration fault ended"),
-        (model_event(m.ModelChange.OPENED), "info", "learned model"),
-        (model_event(m.ModelChange.RESUMED), "info", "learned model"),
-        (model_event(m.ModelChange.SUSPENDED), "warning", "learned model"),
-        (model_event(m.ModelChange.GIVEN_UP), "error", "learned model"),
-    ],
-)
-def test_changes_that_a_reader_of_the_journal_needs_have_an_event_and_a_level(
-    message: m.Message, level: str, event: str
+SEVERITIES = {"warning": (-1, 0, 2, 4), "info": (5, 6, 9), "debug": (7,)}
+STEPS = {"debug": ("normal", "skip"), "info": ("new_fragment", "merge"), "warning": ("widen", "whole_map", "ask")}
+EVENTS = {"info": ("started", "stopped"), "warning": ("died", "stuck", "restarted"), "error": ("gave_up",)}
+CHANGES = {"info": ("opened", "resumed"), "warning": ("provider", "suspended", "failed"), "error": ("given_up",)}
+LINES: list[tuple[m.Message, str]] = [
+    *(
+        (
+            m.StatusText(t_ns=7, severity=severity, text="no map fix"),
+            f"{level} pilot: text to the pilot, text no map fix, severity {severity}",
+        )
+        for level, severities in SEVERITIES.items()
+        for severity in severities
+    ),
+    *(
+        (m.SearchState(t_ns=7, step=m.SearchStep(step)), f"{level} search: search step, step {step}")
+        for level, steps in STEPS.items()
+        for step in steps
+    ),
+    *(
+        (
+            m.ProcessEvent(t_ns=7, process="anchor", event=event, detail="9"),
+            f"{level} supervisor: process {event}, child anchor, detail 9",
+        )
+        for level, events in EVENTS.items()
+        for event in events
+    ),
+    *(
+        (
+            model_event(m.ModelChange(change)),
+            f"{level} xfeat: learned model, model xfeat, change {change}, provider CPU, detail why",
+        )
+        for level, changes in CHANGES.items()
+        for change in changes
+    ),
+    (fault(active=True), "warning calibration: calibration fault, quantity heading, factor 90, detail turns"),
+    (fault(active=False), "info calibration: calibration fault ended, quantity heading, factor 90, detail turns"),
+    (
+        msgspec.structs.replace(fault(active=False), factor=None, detail=""),
+        "info calibration: calibration fault ended, quantity heading",
+    ),
+    (
+        hint(m.Verdict.ACCEPTED),
+        "info hint: position hint, verdict accepted, text hint: search there, distance_m 12, sigma_m 3",
+    ),
+    (
+        hint(m.Verdict.OUTSIDE_MAP),
+        "warning hint: position hint, verdict outside_map, text hint: search there, distance_m 12, sigma_m 3",
+    ),
+    (m.Dropped(t_ns=7, process="link", message="Imu", count=3), "warning link: messages lost, message Imu, count 3"),
+    *(
+        (
+            m.PositionSource(t_ns=7, vision=vision, receiver=1),
+            f"warning link: the autopilot is to navigate by another position, position {position}",
+        )
+        for vision, position in ((True, "Terrafix"), (False, "GNSS receiver 1"))
+    ),
+    (
+        rejected(4, "map", m.Verdict.INNOVATION, "12 m off"),
+        "debug map: measurement rejected, verdict innovation, frame 4, detail 12 m off",
+    ),
+    (rejected(-1, "height", m.Verdict.IMPLAUSIBLE), "debug height: measurement rejected, verdict implausible"),
+    (
+        rejected(4, "reset", m.Verdict.ACCEPTED, "indeterminate"),  # although its verdict is accepted
+        "warning estimator: graph begins again, frame 4, reason indeterminate",
+    ),
+]
+
+
+@pytest.mark.parametrize(("message", "line"), LINES, ids=[line for _, line in LINES])
+def test_a_message_is_a_line_with_its_level_part_and_known_fields_and_an_error_says_what_to_do(
+    message: m.Message, line: str
 ) -> None:
     entry = log_entry(message)
-    assert entry is not None and (entry.level, entry.event) == (level, event)
+    assert entry is not None
+    found, _, todo = f"{entry.level} {entry.part}: {entry.text}".partition(", todo ")
+    assert found == line and (len(todo) > 20) == (entry.level == "error")
 
 
 def test_a_log_line_has_the_fields_of_its_message() -> None:
@@ -108,11 +152,7 @@ def test_of_messages_of_every_frame_only_the_changes_are_lines(messages: list[m.
 
 
 def gps(fix_type: int, reason: str = "") -> m.GpsInput:
-    zero = dict.fromkeys(
-        ("time_week", "time_week_ms", "lat_deg", "lon_deg", "alt_amsl_m", "hdop", "vdop", "vn_mps", "ve_mps", "vd_mps",
-         "speed_accuracy_mps", "horiz_accuracy_m", "vert_accuracy_m", "satellites_visible", "estimate_age_ms"), 0,
-    )  # fmt: skip
-    return m.GpsInput(t_ns=1, fix_type=fix_type, no_fix_reason=reason, **zero)
+    return msgspec.structs.replace(GPS, fix_type=fix_type, no_fix_reason=reason)
 
 
 def test_the_loss_of_the_fix_is_a_warning_with_its_reason_and_each_receiver_has_a_state_of_its_own() -> None:
@@ -124,26 +164,6 @@ def test_the_loss_of_the_fix_is_a_warning_with_its_reason_and_each_receiver_has_
         m.GnssVerdict(t_ns=1, receiver=r, state=m.GnssState.SPOOFED, distance_m=900.0, sigmas=30.0) for r in (0, 1, 0)
     ]
     assert [entry.level if (entry := log.entry(v)) else None for v in spoofed] == ["warning", "warning", None]
-
-
-def test_the_restart_of_the_graph_is_a_warning_although_its_verdict_is_accepted() -> None:
-    verdict = m.MeasurementVerdict(
-        t_ns=1, frame_id=4, measurement="reset", verdict=m.Verdict.ACCEPTED, detail="indeterminate"
-    )
-    entry = log_entry(verdict)
-    assert entry is not None and (entry.level, entry.fields["reason"]) == ("warning", "indeterminate")
-
-
-ERRORS = [
-    m.ProcessEvent(t_ns=1, process="anchor", event="gave_up", detail="died more than 5 times in 60 s"),
-    model_event(m.ModelChange.GIVEN_UP),
-]
-
-
-@pytest.mark.parametrize("message", ERRORS, ids=lambda message: type(message).__name__)
-def test_lines_of_errors_say_what_to_do(message: m.Message) -> None:
-    entry = log_entry(message)
-    assert entry is not None and entry.level == "error" and len(entry.fields["todo"]) > 20
 
 
 def test_all_log_calls_of_the_level_error_in_the_daemon_say_what_to_do() -> None:

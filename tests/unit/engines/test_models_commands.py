@@ -7,10 +7,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import rasterio
 from rasterio.transform import Affine
 from typer.testing import CliRunner
 
+import map_rasters
 import tiny_onnx
 from terrafix.core.errors import MapError, ModelError, OutputError
 from terrafix_engines.providers import CPU, CUDA, TENSORRT
@@ -117,10 +117,8 @@ def test_bench_compares_with_the_describer_without_weights(folder: Path, tmp_pat
 
 
 def raster(path: Path, image: np.ndarray, x_m: float = 500_000.0, crs: int = 32633) -> Path:
-    profile = {"driver": "GTiff", "count": 3, "dtype": "uint8", "width": image.shape[1], "height": image.shape[0]}
-    with rasterio.open(path, "w", crs=crs, transform=Affine(0.5, 0, x_m, 0, -0.5, 5e6), **profile) as file:
-        file.write(image[:, :, ::-1].transpose(2, 0, 1))
-    return path
+    corner = Affine(0.5, 0, x_m, 0, -0.5, 5e6)
+    return map_rasters.write_tif(path, image[:, :, ::-1].transpose(2, 0, 1), f"EPSG:{crs}", corner)
 
 
 @pytest.mark.slow

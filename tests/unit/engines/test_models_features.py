@@ -26,7 +26,8 @@ from terrafix_engines.runtime import ModelRunError
 from terrafix_engines.store import StoredModel, stored_model
 from textured_ground import texture
 
-DETECTOR = """name = "points"
+DETECTOR = tiny_onnx.described(
+    """name = "points"
 title = "an export of points"
 role = "keypoints"
 licence = "CC0"
@@ -40,20 +41,12 @@ scores = "scores"
 descriptors = "desc"
 coordinates = "signed"
 channels_first = true
-[[inputs]]
-name = "image"
-shape = [1, 1, "height", "width"]
-[[outputs]]
-name = "kpts"
-shape = [1, "points", 2]
-[[outputs]]
-name = "scores"
-shape = [1, "points"]
-[[outputs]]
-name = "desc"
-shape = [1, 4, "points"]
-"""
-MATCHER = """name = "glue"
+""",
+    {"image": [1, 1, "height", "width"]},
+    {"kpts": [1, "points", 2], "scores": [1, "points"], "desc": [1, 4, "points"]},
+)
+MATCHER = tiny_onnx.described(
+    """name = "glue"
 title = "an export of a matcher"
 role = "matcher"
 licence = "CC0"
@@ -64,54 +57,11 @@ descriptors = ["d0", "d1"]
 matches = "m"
 scores = "s"
 form = "index"
-[[inputs]]
-name = "k0"
-shape = [1, "points0", 2]
-[[inputs]]
-name = "k1"
-shape = [1, "points1", 2]
-[[inputs]]
-name = "d0"
-shape = [1, "points0", 4]
-[[inputs]]
-name = "d1"
-shape = [1, "points1", 4]
-[[outputs]]
-name = "m"
-shape = [1, "matches"]
-dtype = "int64"
-[[outputs]]
-name = "s"
-shape = [1, "matches"]
-"""
-SEMI_DENSE = """name = "both"
-title = "an export that is given two pictures"
-role = "pair"
-licence = "CC0"
-[image]
-input = "image0"
-colour = "gray"
-multiple = 8
-[pair]
-second = "image1"
-keypoints = ["mkpts0", "mkpts1"]
-scores = "mconf"
-[[inputs]]
-name = "image0"
-shape = [1, 1, "height", "width"]
-[[inputs]]
-name = "image1"
-shape = [1, 1, "height", "width"]
-[[outputs]]
-name = "mkpts0"
-shape = ["pairs", 2]
-[[outputs]]
-name = "mkpts1"
-shape = ["pairs", 2]
-[[outputs]]
-name = "mconf"
-shape = ["pairs"]
-"""
+""",
+    {"k0": [1, "points0", 2], "k1": [1, "points1", 2], "d0": [1, "points0", 4], "d1": [1, "points1", 4]},
+    {"m": [1, "matches"], "s": [1, "matches"]},
+    {"m": "int64"},
+)
 DataSet = Callable[[str], Path]
 
 
@@ -120,12 +70,23 @@ def stored(folder: Path, text: str, content: bytes) -> StoredModel:
     return stored_model(manifest.read(path.with_suffix(".toml")), folder)
 
 
-def exported(folder: Path, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray) -> StoredModel:
+def keypoint_model(
+    keypoints: np.ndarray,
+    scores: np.ndarray,
+    descriptors: np.ndarray,
+    size: tuple[int, int] | tuple[str, str] = ("h", "w"),
+) -> bytes:
+    """``size``: height and width of its images."""
     outputs = {"kpts": keypoints[None], "scores": scores[None], "desc": descriptors[None]}
-    content = tiny_onnx.constants(
-        {"image": ([1, 1, "h", "w"], "float32")}, {k: v.astype(np.float32) for k, v in outputs.items()}
-    )
-    return stored(folder, DETECTOR, content)
+    inputs: dict[str, tuple[tiny_onnx.Shape, str]] = {"image": ([1, 1, *size], "float32")}
+    return tiny_onnx.constants(inputs, {name: values.astype(np.float32) for name, values in outputs.items()})
+
+
+THREE_POINTS = np.zeros((3, 2)), np.ones(3), np.ones((4, 3))
+
+
+def exported(folder: Path, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray) -> StoredModel:
+    return stored(folder, DETECTOR, keypoint_model(keypoints, scores, descriptors))
 
 
 def test_an_image_is_converted_as_the_manifest_specifies() -> None:
@@ -237,10 +198,7 @@ def test_a_matcher_runs_by_its_manifest_and_must_not_match_missing_keypoints(tmp
 
 
 def test_a_model_of_fixed_size_pads_small_images_and_rejects_larger_ones(tmp_path: Path) -> None:
-    outputs = {"kpts": np.zeros((1, 3, 2)), "scores": np.ones((1, 3)), "desc": np.ones((1, 4, 3))}
-    content = tiny_onnx.constants(
-        {"image": ([1, 1, 64, 96], "float32")}, {k: v.astype(np.float32) for k, v in outputs.items()}
-    )
+    content = keypoint_model(*THREE_POINTS, (64, 96))
     detector = open_detector(stored(tmp_path, DETECTOR.replace('"height", "width"', "64, 96"), content))
     assert len(detector.detect(np.zeros((60, 90, 3), np.uint8), 10).xy_px) == 3
     with pytest.raises(ModelRunError, match="takes images of 96x64 px, not 97x60"):
@@ -251,11 +209,7 @@ def test_swapped_outputs_in_a_keypoint_manifest_are_reported(tmp_path: Path) -> 
     text = DETECTOR.replace("channels_first = true\n", "").replace(
         'shape = [1, 4, "points"]', 'shape = [1, "rows", "columns"]'
     )
-    outputs = {"kpts": np.zeros((1, 3, 2)), "scores": np.ones((1, 3)), "desc": np.ones((1, 4, 3))}
-    content = tiny_onnx.constants(
-        {"image": ([1, 1, "h", "w"], "float32")}, {k: v.astype(np.float32) for k, v in outputs.items()}
-    )
-    detector = open_detector(stored(tmp_path, text, content))
+    detector = open_detector(stored(tmp_path, text, keypoint_model(*THREE_POINTS)))
     with pytest.raises(ModelRunError, match=r"points: 3 keypoints, 3 scores, 4 descriptors; check \[keypoints\]"):
         detector.detect(np.zeros((64, 64, 3), np.uint8), 10)
 
@@ -265,7 +219,7 @@ def test_an_image_pair_model_returns_corresponding_points(tmp_path: Path) -> Non
     first, second = np.zeros((8, 20, 3), np.uint8), np.zeros((6, 24, 3), np.uint8)
     for row, (x0, x1) in enumerate(((3, 5), (19, 23), (0, 11), (7, 9), (2, 1), (4, 6))):
         first[row, x0], second[row, x1] = 51 * row, 255
-    matcher = open_pair_matcher(stored(tmp_path, SEMI_DENSE, tiny_onnx.brightest_of_rows()))
+    matcher = open_pair_matcher(stored(tmp_path, tiny_onnx.PAIR, tiny_onnx.brightest_of_rows()))
     found = matcher.match(first, second)
     # Both are padded to 24 x 8. Rows 6 and 7 of the second one are padding, and bright: they must be dropped.
     assert matcher.name == "both"
@@ -275,18 +229,21 @@ def test_an_image_pair_model_returns_corresponding_points(tmp_path: Path) -> Non
 
 
 def test_swapped_outputs_in_a_pair_manifest_are_reported(tmp_path: Path) -> None:
-    other = SEMI_DENSE.replace('name = "image1"\nshape = [1, 1,', 'name = "image1"\nshape = [1, 3,')
+    other = tiny_onnx.PAIR.replace('name = "image1"\nshape = [1, 1,', 'name = "image1"\nshape = [1, 3,')
     for text, reason in (
         (other, "'image1' must have the shape of 'image0'"),
-        (SEMI_DENSE.replace('second = "image1"', 'second = "right"'), "'right' is used, but neither"),
-        (SEMI_DENSE.split("[pair]")[0] + "[[inputs]]" + SEMI_DENSE.split("[[inputs]]", 1)[1], r"a section \[pair\]"),
+        (tiny_onnx.PAIR.replace('second = "image1"', 'second = "right"'), "'right' is used, but neither"),
+        (
+            tiny_onnx.PAIR.split("[pair]")[0] + "[[inputs]]" + tiny_onnx.PAIR.split("[[inputs]]", 1)[1],
+            r"a section \[pair\]",
+        ),
     ):
         with pytest.raises(manifest.ManifestError, match=reason):
             stored(tmp_path, text, b"no model")
     outputs = {"mkpts0": np.zeros((3, 2)), "mkpts1": np.zeros((3, 2)), "mconf": np.zeros(2)}
     pictures: dict[str, tuple[tiny_onnx.Shape, str]] = {f"image{k}": ([1, 1, "h", "w"], "float32") for k in (0, 1)}
     content = tiny_onnx.constants(pictures, {k: v.astype(np.float32) for k, v in outputs.items()})
-    stated = SEMI_DENSE.replace('name = "mconf"\nshape = ["pairs"]', 'name = "mconf"\nshape = ["scores"]')
+    stated = tiny_onnx.PAIR.replace('name = "mconf"\nshape = ["pairs"]', 'name = "mconf"\nshape = ["scores"]')
     matcher = open_pair_matcher(stored(tmp_path, stated, content))
     with pytest.raises(ModelRunError, match=r"both: 3 and 3 points, 2 scores; check \[pair\]"):
         matcher.match(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8, 3), np.uint8))

@@ -38,6 +38,13 @@ def fetch(folder: Path, source: object) -> None:
     fetch_all(["tiny"], str(source), str(folder))
 
 
+def fetched(folder: Path, answer: Callable[[Request], Reply]) -> list[Request]:
+    """Fetches the model from a server. -> its requests."""
+    with serving(answer) as server:
+        fetch(folder, f"{server.url}/tiny.onnx")
+    return server.requests
+
+
 def ranged(request: Request, content: bytes = CONTENT) -> Reply:
     """A server that supports range requests."""
     wanted = request.headers.get("Range", "")
@@ -49,8 +56,7 @@ def ranged(request: Request, content: bytes = CONTENT) -> Reply:
 
 
 def test_fetch_downloads_a_complete_file(folder: Path) -> None:
-    with serving(ranged) as server:
-        fetch(folder, f"{server.url}/tiny.onnx")
+    fetched(folder, ranged)
     assert (folder / "tiny.onnx").read_bytes() == CONTENT
     assert sorted(path.name for path in folder.iterdir()) == ["tiny.onnx", "tiny.toml"]
 
@@ -62,9 +68,7 @@ def test_fetch_resumes_after_a_lost_connection(folder: Path) -> None:
         reply.body = reply.body[:9000]
         return reply
 
-    with serving(cut) as server:
-        fetch(folder, f"{server.url}/tiny.onnx")
-        ranges = [request.headers.get("Range", "") for request in server.requests]
+    ranges = [request.headers.get("Range", "") for request in fetched(folder, cut)]
     assert (folder / "tiny.onnx").read_bytes() == CONTENT
     assert ranges[:3] == ["", "bytes=9000-", "bytes=18000-"]
 
@@ -74,23 +78,20 @@ def test_a_later_fetch_resumes_and_restarts_when_the_partial_file_does_not_match
     for begun, requests in ((CONTENT[:500], 1), (b"another file", 2)):
         (folder / "tiny.onnx").unlink(missing_ok=True)
         part.write_bytes(begun)
-        with serving(ranged) as server:
-            fetch(folder, f"{server.url}/tiny.onnx")
-            assert server.requests[0].headers["Range"] == f"bytes={len(begun)}-" and len(server.requests) == requests
+        sent = fetched(folder, ranged)
+        assert sent[0].headers["Range"] == f"bytes={len(begun)}-" and len(sent) == requests
         assert (folder / "tiny.onnx").read_bytes() == CONTENT and not part.exists()
 
 
 def test_fetch_restarts_on_a_server_without_range_requests(folder: Path) -> None:
     (folder / "tiny.onnx.part").write_bytes(b"x" * 500)
-    with serving(lambda _: Reply(body=CONTENT)) as server:
-        fetch(folder, f"{server.url}/tiny.onnx")
+    fetched(folder, lambda _: Reply(body=CONTENT))
     assert (folder / "tiny.onnx").read_bytes() == CONTENT
 
 
 def test_fetch_retries_a_server_that_recovers(folder: Path) -> None:
     replies = iter([Reply(status=503), Reply(status=429)])
-    with serving(lambda request: next(replies, None) or ranged(request)) as server:
-        fetch(folder, f"{server.url}/tiny.onnx")
+    fetched(folder, lambda request: next(replies, None) or ranged(request))
     assert (folder / "tiny.onnx").read_bytes() == CONTENT
 
 
@@ -115,8 +116,8 @@ ALTERED = CONTENT[:-1] + b"?"
 def test_a_failed_fetch_is_reported_and_leaves_no_model_file(
     folder: Path, answer: Callable[[Request], Reply], reason: str
 ) -> None:
-    with serving(answer) as server, pytest.raises(ModelError) as error:
-        fetch(folder, f"{server.url}/tiny.onnx")
+    with pytest.raises(ModelError) as error:
+        fetched(folder, answer)
     assert reason in str(error.value) and "\n" not in str(error.value)
     assert not (folder / "tiny.onnx").exists()
 
@@ -182,8 +183,8 @@ def test_a_full_disk_is_reported_and_the_partial_file_remains(folder: Path, monk
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with serving(ranged) as server, pytest.raises(OutputError, match=r"tiny\.onnx: No space left on device; the model"):
-        fetch(folder, f"{server.url}/tiny.onnx")
+    with pytest.raises(OutputError, match=r"tiny\.onnx: No space left on device; the model"):
+        fetched(folder, ranged)
     assert not (folder / "tiny.onnx").exists() and (folder / "tiny.onnx.part").stat().st_size == len(CONTENT)
 
 
@@ -197,6 +198,5 @@ def test_two_concurrent_fetches_use_separate_files(folder: Path) -> None:
             other.append(str(error.value))
         return ranged(request)
 
-    with serving(answer) as server:
-        fetch(folder, f"{server.url}/tiny.onnx")
+    fetched(folder, answer)
     assert other and (folder / "tiny.onnx").read_bytes() == CONTENT

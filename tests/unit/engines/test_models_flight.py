@@ -78,8 +78,12 @@ def ground() -> np.ndarray:
     return texture(8, SIDE_M)
 
 
-def test_the_provider_and_the_reasons_against_better_ones_are_published(tmp_path: Path, ground: np.ndarray) -> None:
-    flight = Flight(tmp_path, ground)
+@pytest.fixture
+def flight(tmp_path: Path, ground: np.ndarray) -> Flight:
+    return Flight(tmp_path, ground)
+
+
+def test_the_provider_and_the_reasons_against_better_ones_are_published(flight: Flight) -> None:
     (event,) = flight.begun
     assert isinstance(event, ModelEvent)
     assert (event.t_ns, event.model, event.change) == (7, "xfeat", ModelChange.OPENED)
@@ -88,16 +92,14 @@ def test_the_provider_and_the_reasons_against_better_ones_are_published(tmp_path
         assert str(over) in event.detail
 
 
-def test_without_need_the_model_does_not_run_and_the_match_says_so(tmp_path: Path, ground: np.ndarray) -> None:
-    flight = Flight(tmp_path, ground)
+def test_without_need_the_model_does_not_run_and_the_match_says_so(flight: Flight) -> None:
     match, events = flight.frame(flight.blue)
     assert (match.verdict, match.matcher, events) == (Verdict.ACCEPTED, "gradient", [])
     assert flight.describer.model.run_count == 0
 
 
 @pytest.mark.usefixtures("no_gradient_pose")
-def test_a_failed_inference_loses_one_frame_only(tmp_path: Path, ground: np.ndarray) -> None:
-    flight = Flight(tmp_path, ground)
+def test_a_failed_inference_loses_one_frame_only(flight: Flight) -> None:
     match, events = flight.frame(flight.blue)
     assert (match.verdict, match.search.step, match.matcher) == (Verdict.MODEL_FAILED, SearchStep.SKIP, "xfeat")
     assert match.pose is None
@@ -107,8 +109,7 @@ def test_a_failed_inference_loses_one_frame_only(tmp_path: Path, ground: np.ndar
 
 
 @pytest.mark.usefixtures("no_gradient_pose")
-def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(tmp_path: Path, ground: np.ndarray) -> None:
-    flight = Flight(tmp_path, ground)
+def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(flight: Flight) -> None:
     for _ in range(MAX_FAILURES):
         match, events = flight.frame(flight.blue)
     assert match.verdict is Verdict.MODEL_FAILED
@@ -119,8 +120,7 @@ def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(tmp_pat
 
 
 @pytest.mark.usefixtures("no_gradient_pose")
-def test_only_consecutive_failures_count(tmp_path: Path, ground: np.ndarray) -> None:
-    flight = Flight(tmp_path, ground)
+def test_only_consecutive_failures_count(flight: Flight) -> None:
     for image in [*[flight.blue] * (MAX_FAILURES - 1), flight.seen, *[flight.blue] * (MAX_FAILURES - 1)]:
         match, _ = flight.frame(image)
     assert match.matcher == "xfeat"
@@ -129,8 +129,7 @@ def test_only_consecutive_failures_count(tmp_path: Path, ground: np.ndarray) -> 
 
 
 @pytest.mark.usefixtures("no_gradient_pose")
-def test_a_learned_model_is_suspended_while_the_thermal_band_is_critical(tmp_path: Path, ground: np.ndarray) -> None:
-    flight = Flight(tmp_path, ground)
+def test_a_learned_model_is_suspended_while_the_thermal_band_is_critical(flight: Flight) -> None:
     changes = []
     for band in (ThermalBand.HOT, ThermalBand.CRITICAL, ThermalBand.CRITICAL, ThermalBand.NORMAL):
         health = Health(t_ns=0, band=band, temperature_c=96.0, throttled=False, disk_free_mb=None, cause="test")
@@ -141,8 +140,7 @@ def test_a_learned_model_is_suspended_while_the_thermal_band_is_critical(tmp_pat
     assert changes == [("xfeat", []), ("gradient", suspended), ("gradient", []), ("xfeat", resumed)]
 
 
-def test_a_failed_provider_is_published(tmp_path: Path, ground: np.ndarray) -> None:
-    flight = Flight(tmp_path, ground)
+def test_a_failed_provider_is_published(flight: Flight) -> None:
     flight.describer.model.rejected_providers.append(RejectedProvider(CUDA, "failed while it ran: out of memory"))
     _, events = flight.frame(flight.seen)
     (event,) = events

@@ -21,59 +21,8 @@ from terrafix_engines.retrieval.places import (
 from terrafix_engines.runtime import ModelFileError, ModelRunError
 from textured_ground import texture
 
-GLOBAL = """name = "means"
-title = "mean colours of a grid"
-role = "global"
-licence = "CC0"
-[image]
-input = "image"
-colour = "rgb"
-multiple = 14
-mean = [0.485, 0.456, 0.406]
-std = [0.229, 0.224, 0.225]
-[vector]
-output = "vector"
-size = 12
-side_px = 28
-[[inputs]]
-name = "image"
-shape = [1, 3, 28, 28]
-[[outputs]]
-name = "vector"
-shape = [1, 12]
-"""
 
-
-PAIR = """name = "both"
-title = "takes two images"
-role = "pair"
-licence = "CC0"
-[image]
-input = "image0"
-colour = "gray"
-[pair]
-second = "image1"
-keypoints = ["mkpts0", "mkpts1"]
-scores = "mconf"
-[[inputs]]
-name = "image0"
-shape = [1, 1, "height", "width"]
-[[inputs]]
-name = "image1"
-shape = [1, 1, "height", "width"]
-[[outputs]]
-name = "mkpts0"
-shape = ["pairs", 2]
-[[outputs]]
-name = "mkpts1"
-shape = ["pairs", 2]
-[[outputs]]
-name = "mconf"
-shape = ["pairs"]
-"""
-
-
-def model_folder(folder: Path, manifest: str = GLOBAL) -> Path:
+def model_folder(folder: Path, manifest: str = tiny_onnx.GLOBAL) -> Path:
     tiny_onnx.write(folder, manifest, tiny_onnx.mean_colours(14))
     return folder
 
@@ -169,12 +118,12 @@ def test_names_differ_when_weights_differ(tmp_path: Path) -> None:
 
 
 def test_models_that_cannot_describe_places_are_refused_in_one_line(tmp_path: Path) -> None:
-    tiny_onnx.write(tmp_path, PAIR, tiny_onnx.brightest_of_rows())
+    tiny_onnx.write(tmp_path, tiny_onnx.PAIR, tiny_onnx.brightest_of_rows())
     with pytest.raises(ModelFileError, match="its role is pair, not dense or global"):
         open_place_describer("both", str(tmp_path))
     with pytest.raises(ModelFileError, match=r"'nothing'.*or pooled-gradient"):
         open_place_describer("nothing", str(tmp_path))
-    wrong = GLOBAL.replace("size = 12", "size = 13").replace("[1, 12]", '[1, "n"]')
+    wrong = tiny_onnx.GLOBAL.replace("size = 12", "size = 13").replace("[1, 12]", '[1, "n"]')
     other = tmp_path / "other"
     other.mkdir()
     with pytest.raises(ModelRunError, match="a vector of 12 numbers, not 13"):
@@ -193,7 +142,7 @@ def test_models_that_cannot_describe_places_are_refused_in_one_line(tmp_path: Pa
 def test_an_inconsistent_manifest_of_a_global_model_is_refused(
     tmp_path: Path, old: str, new: str, message: str
 ) -> None:
-    assert old in GLOBAL
-    model_folder(tmp_path, GLOBAL.replace(old, new))
+    assert old in tiny_onnx.GLOBAL
+    model_folder(tmp_path, tiny_onnx.GLOBAL.replace(old, new))
     with pytest.raises(ManifestError, match=message):
         read(tmp_path / "means.toml")

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import rasterio
 from rasterio.transform import Affine
 
+import map_rasters
 from terrafix_engines.train.errors import TrainingError
 from terrafix_engines.train.ground import Place, read_list, read_places
 
@@ -18,10 +18,8 @@ GSD_M = 0.5
 
 def geotiff(path: Path, picture: np.ndarray, west_m: float, north_m: float, gsd_m: float = GSD_M) -> None:
     """``picture`` (H, W, 3) RGB."""
-    transform = Affine(gsd_m, 0, west_m, 0, -gsd_m, north_m)
-    size = {"height": picture.shape[0], "width": picture.shape[1], "count": 3}
-    with rasterio.open(path, "w", driver="GTiff", dtype="uint8", crs="EPSG:32633", transform=transform, **size) as file:
-        file.write(picture.transpose(2, 0, 1))
+    corner = Affine(gsd_m, 0, west_m, 0, -gsd_m, north_m)
+    map_rasters.write_tif(path, picture.transpose(2, 0, 1), "EPSG:32633", corner)
 
 
 def ground(seed: int, height: int, width: int) -> np.ndarray:

@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from link_rig import (
@@ -24,14 +25,13 @@ from link_rig import (
     gps,
     texts,
 )
-from link_wire import MemoryWire
+from link_wire import WiredEdge
 from terrafix import messages as m
-from terrafix.core.config import Config, LinkSection
+from terrafix.core.config import Config
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import NodeContext
 from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.integrity import fix_type
 from terrafix.link.integrity.output_predictor import (
     InertialBuffer,
@@ -42,6 +42,7 @@ from terrafix.link.integrity.output_predictor import (
 )
 from terrafix.link.node import LinkNode, make_node
 from terrafix.link.output.gps_time import WEEK_MS, week_and_ms
+from vision_origin import PINHOLE_ORIGIN
 
 
 def no_messages(_: int) -> list[m.Message]:
@@ -69,12 +70,6 @@ def test_late_estimates_at_2_hz_give_accurate_gps_input_at_10_hz() -> None:
     assert {v.verdict for v in verdicts(published)} == {m.Verdict.ACCEPTED}
 
 
-def test_no_position_is_sent_twice() -> None:
-    published = fly(LinkNode(10.0), 0, 10 * S, every(S // 2, estimate))
-    places = [(g.lat_deg, g.lon_deg) for g in gps(published) if g.fix_type == 3]
-    assert len(places) == len(set(places)) > 90
-
-
 def test_the_link_node_is_deterministic() -> None:
     feed = every(300 * MS, lambda t: estimate(t, east_m=math.sin(t / S) * 3))
     assert fly(LinkNode(10.0), 0, 30 * S, feed) == fly(LinkNode(10.0), 0, 30 * S, feed)
@@ -95,21 +90,9 @@ def test_reported_accuracy_grows_with_the_age_of_the_estimate() -> None:
 
 def test_before_the_first_estimate_fix_type_is_1_without_a_position() -> None:
     node = LinkNode(10.0)
-    origin = m.Origin(
-        t_ns=0,
-        camera=m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0),
-        lat_deg=LAT,
-        lon_deg=LON,
-        ground_amsl_m=500.0,
-        start_sigma_m=5,
-        yaw_sigma_deg=1,
-        agl_sigma_m=1,
-        attitude_sigma_deg=1,
-    )
+    origin = msgspec.structs.replace(PINHOLE_ORIGIN, ground_amsl_m=500.0)
     published = gps(fly(node, 0, 60 * S, lambda now: [origin] if now == 0 else []))
-    assert (
-        len(published) == 600
-    )  # no silence before the first estimate: an autopilot that boots must receive fix type 1
+    assert len(published) == 600  # no silence before the first estimate: a booting autopilot must receive fix type 1
     assert {(g.fix_type, g.lat_deg, g.lon_deg, g.satellites_visible) for g in published} == {(1, 0.0, 0.0, 0)}
     assert {g.alt_amsl_m for g in published} == {500.0}
     assert {g.no_fix_reason for g in published} == {"no estimate yet"}
@@ -132,23 +115,17 @@ def test_a_stale_estimate_gives_fix_type_1_then_silence_and_recovers_immediately
     assert any("GPS_INPUT stopped" in t for t in texts(published))
 
 
-@pytest.mark.parametrize(("sigma_m", "fix_type"), [(4.0, 3), (35.0, 3), (60.0, 1), (1e6, 1)])
-def test_covariance_decides_the_fix_type(sigma_m: float, fix_type: int) -> None:
-    published = fly(LinkNode(10.0), 0, 5 * S, every(200 * MS, lambda t: estimate(t, sigma_m=sigma_m)))
-    last = gps(published)[-1]
-    assert last.fix_type == fix_type
-    assert last.horiz_accuracy_m <= 100.0
-    if fix_type == 3:
-        assert last.horiz_accuracy_m >= sigma_m
-
-
-@pytest.mark.parametrize(("sigma_mps", "fix_type"), [(0.3, 3), (1.0, 3), (1.6, 1)])
-def test_speed_accuracy_above_1_5_lowers_the_fix(sigma_mps: float, fix_type: int) -> None:
-    feed = every(100 * MS, lambda t: estimate(t, velocity_sigma=sigma_mps))
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_mps", "fix_type"),
+    [(4.0, 0.5, 3), (35.0, 0.5, 3), (60.0, 0.5, 1), (1e6, 0.5, 1), (4.0, 0.3, 3), (4.0, 1.0, 3), (4.0, 1.6, 1)],
+)
+def test_the_accuracy_of_position_and_speed_decides_the_fix_type(
+    sigma_m: float, sigma_mps: float, fix_type: int
+) -> None:
+    feed = every(100 * MS, lambda t: estimate(t, sigma_m=sigma_m, velocity_sigma=sigma_mps))
     last = gps(fly(LinkNode(10.0), 0, 5 * S, feed))[-1]
-    assert last.fix_type == fix_type
-    if fix_type == 3:
-        assert sigma_mps <= last.speed_accuracy_mps < 1.5
+    assert last.fix_type == fix_type and last.horiz_accuracy_m <= 100.0
+    assert fix_type == 1 or (last.horiz_accuracy_m >= sigma_m and sigma_mps <= last.speed_accuracy_mps < 1.5)
 
 
 def test_the_fix_type_has_hysteresis_at_the_accuracy_limit() -> None:
@@ -302,9 +279,8 @@ def test_the_degradation_level_changes_accuracy_and_text() -> None:
     assert accuracy[50] == pytest.approx(2 * accuracy[4], rel=0.05)
     ladder = [t for t in texts(published) if "map fix" in t]
     assert ladder == [f"Terrafix: no map fix for {s} s" for s in (5, 15, 35)]
-    assert {g.fix_type for g in gps_since(published, 1 * S)} == {
-        3
-    }  # odometry continues, and the covariance covers its error
+    # Odometry continues, and the covariance covers its error.
+    assert {g.fix_type for g in gps_since(published, 1 * S)} == {3}
 
 
 def test_dead_reckoning_on_the_last_degradation_level_has_no_fix() -> None:
@@ -439,14 +415,12 @@ def test_a_restarted_link_continues_with_the_clock_of_the_checkpoint(tmp_path: P
     unix = 1_795_000_000 * S
     first = LinkNode(10.0)
     first.on(m.WallClock(t_ns=50 * S, unix_ns=unix, source="system"))
-    checkpoint_writer = CheckpointWriter(tmp_path / "link.checkpoint")
-    checkpoint_writer.on_heartbeat(ArmedAutopilot(1, 3, 1))
-    edge = MavlinkEdge(LinkSection(), MemoryWire(), lambda: 0, checkpoint_writer=checkpoint_writer)
+    checkpoint = tmp_path / "link.checkpoint"
+    CheckpointWriter(checkpoint).on_heartbeat(ArmedAutopilot(1, 3, 1))
+    link = WiredEdge(checkpoint=checkpoint)
     for sent in gps(fly(first, 100 * S, 101 * S, every(500 * MS, estimate))):
-        edge.on_message(sent)
-    second = make_node(
-        NodeContext(Config(), MemoryFrameStore(), None, tmp_path, checkpoint=tmp_path / "link.checkpoint")
-    )
+        link.edge.on_message(sent)
+    second = make_node(NodeContext(Config(), MemoryFrameStore(), None, tmp_path, checkpoint=checkpoint))
     second.on(m.VehicleState(t_ns=102 * S, source="mavlink", armed=True))
     second.on(m.WallClock(t_ns=102 * S, unix_ns=unix - 25 * HOUR_MS * MS, source="system"))
     for sent in gps(fly(second, 102 * S, 103 * S, no_messages)):

@@ -15,48 +15,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+import gps_messages
 from autopilot_rig import GOOD, Rig
-from link_wire import MemoryWire, attitude, heartbeat, packed
-from terrafix import messages as m
+from link_wire import WiredEdge, attitude, decoded, heartbeat
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.integrity.output_predictor import east_north_m, offset
 from terrafix.link.output import global_position, gps_time, msp, nmea, odometry
 from terrafix.link.output.odometry import Attitude, GeodeticPoint
 from terrafix.link.output.selection import PositionOutputs
 from terrafix.link.output.serial_outputs import open_serial_outputs
 from terrafix_tools.sim.autopilot.parameters import Kind
+from vision_origin import PINHOLE_ORIGIN
 
 S, MS = 1_000_000_000, 1_000_000
 WHEN = datetime(2026, 11, 21, 12, 35, 19, 250_000, tzinfo=UTC)
 WEEK, WEEK_MS = gps_time.week_and_ms(int(WHEN.timestamp() * 1000) * MS)
-GPS = m.GpsInput(
-    t_ns=123_456_789_000,
-    fix_type=3,
-    time_week=WEEK,
-    time_week_ms=WEEK_MS,
-    lat_deg=48.117_300_5,
-    lon_deg=-11.516_666_7,
-    alt_amsl_m=545.4,
-    hdop=1.0,
-    vdop=1.0,
-    vn_mps=-3.0,
-    ve_mps=4.0,
-    vd_mps=-0.5,
-    speed_accuracy_mps=0.75,
-    horiz_accuracy_m=6.5,
-    vert_accuracy_m=4.5,
-    satellites_visible=6,
-    estimate_age_ms=180.0,
-)
+PLACE: dict[str, Any] = {"lat_deg": 48.117_300_5, "lon_deg": -11.516_666_7, "alt_amsl_m": 545.4}
+GPS = msgspec.structs.replace(gps_messages.GPS, time_week=WEEK, time_week_ms=WEEK_MS, vn_mps=-3.0, ve_mps=4.0, **PLACE)
 NO_FIX = msgspec.structs.replace(GPS, fix_type=1, lat_deg=0.0, lon_deg=0.0, satellites_visible=0, time_week=0)
 ORIGIN = GeodeticPoint(48.0, -11.5, 500.0)
 BANKED = Attitude(0.4, -0.2, 2.5)
-
-
-def decoded(message: Any) -> Any:
-    return mavlink.MAVLink(None).decode(bytearray(packed(message, mavlink.MAVLink(None, 1, 197))))
 
 
 # --- ODOMETRY and VISION_POSITION_ESTIMATE ---
@@ -308,10 +287,6 @@ def test_gps_week_and_unix_time_are_inverse(unix_ms: int) -> None:
 # --- selection and timing ---
 
 
-def edge_on(wire: MemoryWire, **changes: Any) -> MavlinkEdge:
-    return MavlinkEdge(LinkSection(**changes), wire, lambda: 0)
-
-
 @pytest.mark.parametrize(
     ("firmware", "configured", "sent"),
     [
@@ -329,48 +304,31 @@ def test_outputs_are_those_of_the_configuration_otherwise_of_the_firmware(
 
 
 def test_px4_gets_global_position_sensor_with_a_fix_and_no_gps_input() -> None:
-    wire = MemoryWire()
-    edge = edge_on(wire)
-    wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_PX4), mavlink.MAVLink(None, 7, 1)))
-    list(edge.poll(0))
-    wire.take()
-    edge.on_message(GPS)
-    (sent,) = wire.take()
+    link = WiredEdge()
+    link.receives(0, heartbeat(mavlink.MAV_AUTOPILOT_PX4))
+    link.wire.take()
+    link.edge.on_message(GPS)
+    (sent,) = link.wire.take()
     assert (sent.get_type(), sent.target_system) == ("GLOBAL_POSITION_SENSOR", 7)
-    edge.on_message(NO_FIX)
-    assert wire.take() == []  # PX4 takes any message for a position
+    link.edge.on_message(NO_FIX)
+    assert link.wire.take() == []  # PX4 takes any message for a position
 
 
 def test_local_frame_outputs_wait_for_the_origin_and_stop_without_a_fix() -> None:
-    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
-    edge = edge_on(wire, outputs=["odometry", "vision_position"])
-    edge.on_message(
-        m.Origin(
-            t_ns=0,
-            camera=m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0),
-            lat_deg=48.0,
-            lon_deg=-11.5,
-            ground_amsl_m=500.0,
-            start_sigma_m=5.0,
-            yaw_sigma_deg=5.0,
-            agl_sigma_m=5.0,
-            attitude_sigma_deg=2.0,
-        )
-    )
-    wire.arrive(packed(heartbeat(), autopilot), packed(attitude(1), autopilot))
-    list(edge.poll(GPS.t_ns - 4 * S))
+    link = WiredEdge(outputs=["odometry", "vision_position"])
+    edge, wire = link.edge, link.wire
+    edge.on_message(msgspec.structs.replace(PINHOLE_ORIGIN, lat_deg=48.0, lon_deg=-11.5, ground_amsl_m=500.0))
+    link.receives(GPS.t_ns - 4 * S, heartbeat(), attitude(1))
     requested = [a for a in wire.take("COMMAND_LONG") if a.command == mavlink.MAV_CMD_REQUEST_MESSAGE]
     assert [a.param1 for a in requested] == [49.0]  # GPS_GLOBAL_ORIGIN
     edge.on_message(GPS)
     assert wire.take() == []
-    wire.arrive(packed(heartbeat(), autopilot))
-    status = [x for x in edge.poll(GPS.t_ns - S) if isinstance(x, m.LinkStatus)][-1]
-    assert "waits for the autopilot's origin" in status.detail
+    link.receives(GPS.t_ns - S, heartbeat())
+    assert "waits for the autopilot's origin" in link.status().detail
     (set_origin,) = wire.take("SET_GPS_GLOBAL_ORIGIN")  # the autopilot has none: it gets the start of the flight
     assert (set_origin.latitude, set_origin.longitude, set_origin.altitude) == (480_000_000, -115_000_000, 500_000)
     origin = mavlink.MAVLink_gps_global_origin_message(480_000_000, -115_000_000, 500_000)
-    wire.arrive(packed(origin, autopilot), packed(attitude(2), autopilot))
-    list(edge.poll(GPS.t_ns))
+    link.receives(GPS.t_ns, origin, attitude(2))
     wire.take()
     edge.on_message(GPS)
     assert [x.get_type() for x in wire.take()] == ["ODOMETRY", "VISION_POSITION_ESTIMATE"]
@@ -379,14 +337,13 @@ def test_local_frame_outputs_wait_for_the_origin_and_stop_without_a_fix() -> Non
 
 
 def test_external_positions_are_sent_every_five_seconds_with_a_good_accuracy_only() -> None:
-    wire = MemoryWire()
-    edge = edge_on(wire, outputs=["external_position"])
+    link = WiredEdge(outputs=["external_position"])
     for tenth in range(100):
-        edge.on_message(msgspec.structs.replace(GPS, t_ns=tenth * 100 * MS))
-    assert len(wire.take("COMMAND_INT")) == 2
-    edge.on_message(msgspec.structs.replace(GPS, t_ns=20 * S, horiz_accuracy_m=31.0))
-    edge.on_message(msgspec.structs.replace(NO_FIX, t_ns=30 * S))
-    assert wire.take() == []
+        link.edge.on_message(msgspec.structs.replace(GPS, t_ns=tenth * 100 * MS))
+    assert len(link.wire.take("COMMAND_INT")) == 2
+    link.edge.on_message(msgspec.structs.replace(GPS, t_ns=20 * S, horiz_accuracy_m=31.0))
+    link.edge.on_message(msgspec.structs.replace(NO_FIX, t_ns=30 * S))
+    assert link.wire.take() == []
 
 
 @pytest.mark.parametrize("uptime_days", [0.01, 1.0, 10.0, 49.0, 200.0])
@@ -418,18 +375,18 @@ def test_nmea_and_msp_are_sent_on_their_own_devices_and_one_may_be_lost() -> Non
         masters.append(master)
         names.append(os.ttyname(slave))
         os.close(slave)
-    edge = edge_on(MemoryWire(), nmea_device=names[0], nmea_baud=9600, msp_device=names[1])
-    edge.on_message(GPS)
+    link = WiredEdge(nmea_device=names[0], nmea_baud=9600, msp_device=names[1])
+    link.edge.on_message(GPS)
     time.sleep(0.01)
     assert os.read(masters[0], 4096) == nmea.sentences(GPS)
     assert os.read(masters[1], 4096) == msp.frame(GPS)
     os.close(masters[0])
-    edge.on_message(GPS)
-    (status,) = [x for x in edge.poll(0) if isinstance(x, m.LinkStatus)]
-    assert f"{names[0]}: connection lost" in status.detail
+    link.edge.on_message(GPS)
+    link.poll(0)
+    assert f"{names[0]}: connection lost" in link.status().detail
     time.sleep(0.01)
     assert os.read(masters[1], 4096) == msp.frame(GPS)
-    edge.close()
+    link.edge.close()
     os.close(masters[1])
 
 

@@ -17,12 +17,13 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_rig import ALT, LAT, LON, MS, SPEED_EAST, S, covariance, estimate, every, fly, gps, live
+from gps_messages import GPS
+from link_rig import ALT, MS, SPEED_EAST, S, estimate, every, fly, gps, live
+from live_flight import LiveFlight, eastward
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError, SourceError
 from terrafix.link.edge import open_edge
-from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.mavlink.message_rates import STREAMS_HZ
 from terrafix.link.node import LinkNode
 from terrafix.link.output import gps_input
@@ -37,28 +38,10 @@ CONFIG = Path(__file__).resolve().parents[3] / "config"
 
 
 def message(**changes: Any) -> Any:
-    """A valid GPS_INPUT with changes."""
-    fields = dict(
-        time_usec=0,
-        gps_id=0,
-        ignore_flags=0,
-        time_week_ms=1000,
-        time_week=0,
-        fix_type=3,
-        lat=round(LAT * 1e7),
-        lon=round(LON * 1e7),
-        alt=500.0,
-        hdop=1.0,
-        vdop=1.0,
-        vn=1.0,
-        ve=2.0,
-        vd=0.0,
-        speed_accuracy=0.3,
-        horiz_accuracy=2.0,
-        vert_accuracy=3.0,
-        satellites_visible=6,
-    )
-    return mavlink.MAVLink_gps_input_message(**(fields | changes))
+    """A valid GPS_INPUT without GPS time, with other fields."""
+    sent = gps_input.encode(msgspec.structs.replace(GPS, time_week=0), 0)
+    vars(sent).update(changes)
+    return sent
 
 
 def fed(driver: GpsInputDriver, period_s: float, count: int, start_s: float = 0.0, **changes: Any) -> float:
@@ -115,16 +98,6 @@ def test_fact_after_4_s_of_silence_the_receiver_is_gone() -> None:
 @pytest.mark.parametrize("fix_type", [0, 1, 2])
 def test_fact_below_3d_nothing_reaches_the_ekf(fix_type: int) -> None:
     assert GpsInputDriver(0, 5.0).on_report(message(fix_type=fix_type), 0.0) is None
-
-
-def test_fact_an_ignored_velocity_stays_at_its_last_value() -> None:
-    driver = GpsInputDriver(0, 5.0)
-    never = driver.on_report(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.0)
-    driver.on_report(message(vn=5.0), 0.1)
-    stuck = driver.on_report(message(ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ, vn=9.0), 0.2)
-    assert never is not None
-    assert stuck is not None
-    assert (never.velocity_ned_mps[0], stuck.velocity_ned_mps[0]) == (0.0, 5.0)
 
 
 def test_fact_the_driver_assumes_a_delay_of_200_ms_unless_configured() -> None:
@@ -232,35 +205,10 @@ def test_fact_no_single_report_has_a_bad_accuracy() -> None:
 # --- end to end ---
 
 
-def course(t_s: float) -> PeerState:
-    lat, lon = offset(LAT, LON, SPEED_EAST * t_s, 0.0)
-    return PeerState(lat, lon, ALT, 120.0, math.pi / 2, 0.02, 0.0, 0.0, SPEED_EAST, 0.0)
-
-
-class Flight:
-    """Clock and estimates for link and simulated autopilot: 4 Hz, 150 ms late, with an error ``east_m``."""
-
-    def __init__(self) -> None:
-        self.zero_ns = time.monotonic_ns()
-        self._next_ns = 0
-        self.east_m = 0.0
-
-    def clock(self) -> float:
-        return (time.monotonic_ns() - self.zero_ns) * 1e-9
-
-    def feed(self, now_ns: int) -> list[m.Message]:
-        if now_ns < self._next_ns:
-            return []
-        self._next_ns = now_ns + 250 * MS
-        at_ns = now_ns - 150 * MS
-        late = estimate(at_ns - self.zero_ns, east_m=self.east_m, cov=covariance(3.0))
-        return [msgspec.structs.replace(late, t_ns=at_ns, emitted_at_ns=now_ns)]
-
-
 @pytest.mark.slow
 def test_the_simulated_autopilot_navigates_on_the_gps_input_of_the_link(tmp_path: Path) -> None:
-    flight, peer = Flight(), AutopilotPeer(seed=3)
-    port = peer.start(0, course, flight.clock)
+    flight, peer = LiveFlight(), AutopilotPeer(seed=3)
+    port = peer.start(0, eastward, flight.clock)
     edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{port}"))
     published = live(LinkNode(10.0), edge, 3.0, flight.feed)
     report = peer.stop()
@@ -293,8 +241,8 @@ def test_the_simulated_autopilot_navigates_on_the_gps_input_of_the_link(tmp_path
 @pytest.mark.slow
 def test_gps_input_keeps_its_interval_for_20_s_with_one_wrong_estimate(stall_ms: Callable[[], float]) -> None:
     """AC-14 and AC-3, with the scheduling delay of this machine added."""
-    flight, peer = Flight(), AutopilotPeer(seed=4)
-    edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{peer.start(0, course, flight.clock)}"))
+    flight, peer = LiveFlight(), AutopilotPeer(seed=4)
+    edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{peer.start(0, eastward, flight.clock)}"))
     node = LinkNode(10.0)
 
     def feed(now_ns: int) -> list[m.Message]:
@@ -319,7 +267,7 @@ def test_gps_input_keeps_its_interval_for_20_s_with_one_wrong_estimate(stall_ms:
 
 def test_the_simulated_autopilot_answers_parameters_and_rejects_other_commands() -> None:
     peer = AutopilotPeer()
-    port = peer.start(0, course)
+    port = peer.start(0, eastward)
     wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     wire.settimeout(2.0)
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=197)
@@ -345,28 +293,19 @@ def test_a_used_port_of_the_simulated_autopilot_raises_one_line() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         with pytest.raises(LinkError, match="cannot be used"):
-            AutopilotPeer().start(taken.getsockname()[1], course)
+            AutopilotPeer().start(taken.getsockname()[1], eastward)
 
 
 def test_the_simulated_autopilot_runs_in_its_own_process(tmp_path: Path) -> None:
-    write_course(tmp_path / "course.csv", [(t / 2, course(t / 2)) for t in range(60)])
+    write_course(tmp_path / "course.csv", [(t / 2, eastward(t / 2)) for t in range(60)])
     out = tmp_path / "peer.json"
-    command = [
-        sys.executable,
-        "-m",
-        "terrafix_tools.sim.autopilot.process",
-        str(tmp_path / "course.csv"),
-        "--port",
-        "0",
-        "--out",
-        str(out),
-    ]
     zero_ns = time.monotonic_ns()
-    with subprocess.Popen([*command, "--start-ns", str(zero_ns)], stdout=subprocess.PIPE, text=True) as process:
+    options = ["--port", "0", "--out", str(out), "--start-ns", str(zero_ns)]
+    command = [sys.executable, "-m", "terrafix_tools.sim.autopilot.process", str(tmp_path / "course.csv"), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         port = int(process.stdout.readline().rsplit(":", 1)[1])
-        flight = Flight()
-        flight.zero_ns = zero_ns
+        flight = LiveFlight(zero_ns)
         edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{port}"))
         live(LinkNode(10.0), edge, 1.5, flight.feed)
         os.kill(process.pid, signal.SIGTERM)

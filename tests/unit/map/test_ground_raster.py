@@ -11,6 +11,7 @@ import rasterio
 from pyproj import Transformer
 from rasterio.transform import Affine
 
+import map_rasters
 from terrafix import messages as m
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
@@ -85,13 +86,6 @@ def test_a_rendered_frame_matches_a_real_map(
     assert off_px == pytest.approx(3.0, abs=0.2)  # the metric detects a known offset
 
 
-def write(path: Path, bands: np.ndarray, transform: Affine, crs: str, nodata: float | None = None) -> Path:
-    profile = {"driver": "GTiff", "count": len(bands), "height": bands.shape[1], "width": bands.shape[2]}
-    with rasterio.open(path, "w", dtype=bands.dtype, crs=crs, transform=transform, nodata=nodata, **profile) as file:
-        file.write(bands)
-    return path
-
-
 def blob_image(lat_deg: float, lon_deg: float, crs: str, transform: Affine, size: int) -> np.ndarray:
     """(1, size, size) uint8: a white blob of 2 m at a WGS84 position, on grey."""
     x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(lon_deg, lat_deg)
@@ -112,7 +106,7 @@ def test_ground_rasters_of_all_projections_and_band_counts_are_georeferenced_cor
     step = (0.5 / 74_400.0, 0.5 / 111_200.0) if crs == "EPSG:4326" else (0.5, 0.5)
     transform = Affine(step[0], 0, x - 400 * step[0], 0, -step[1], y + 400 * step[1])
     image = np.repeat(blob_image(*place, crs, transform, 800), count, axis=0)
-    ground = open_ground(write(tmp_path / "map.tif", image, transform, crs), None, frame)
+    ground = open_ground(map_rasters.write_tif(tmp_path / "map.tif", image, crs, transform), None, frame)
     p_c = np.array([30.0, 20.0, 100.0])
     picture = Renderer(ground, CAMERA, film=PLAIN).frame(p_c, down(0.0), 0)[..., 1].astype(float)
     e_m, n_m = frame.to_local(*place)
@@ -124,46 +118,42 @@ def test_ground_rasters_of_all_projections_and_band_counts_are_georeferenced_cor
     assert np.hypot(seen[0] - expected[0], seen[1] - expected[1]) < (0.7 if crs == "EPSG:4326" else 0.2)
 
 
+FRAME = LocalFrame(48.1, 14.4)
+HERE = (FRAME.lat_deg, FRAME.lon_deg)
+
+
+def plain(path: Path, side_px: int = 400) -> Path:
+    """An image of one grey around HERE, at 0.5 m."""
+    return map_rasters.around(path, np.full((3, side_px, side_px), 90, np.uint8), "EPSG:32633", HERE, 0.5)
+
+
 def test_voids_and_the_area_outside_have_the_mean_colour(tmp_path: Path) -> None:
-    frame = LocalFrame(48.1, 14.4)
-    x, y = Transformer.from_crs(4326, 32633, always_xy=True).transform(frame.lon_deg, frame.lat_deg)
     image = np.full((3, 400, 400), 90, np.uint8)
     image[:, :, 100:160] = 0
-    transform = Affine(0.5, 0, x - 100, 0, -0.5, y + 100)
-    ground = open_ground(write(tmp_path / "map.tif", image, transform, "EPSG:32633", nodata=0), None, frame)
+    path = map_rasters.around(tmp_path / "map.tif", image, "EPSG:32633", HERE, 0.5, nodata=0)
+    ground = open_ground(path, None, FRAME)
     picture = Renderer(ground, CAMERA, film=PLAIN).frame(np.array([0.0, 0.0, 200.0]), down(0.0), 0)
     assert picture.min() == picture.max() == 90
 
 
 def test_elevation_voids_are_filled_from_their_neighbours(tmp_path: Path) -> None:
-    frame = LocalFrame(48.1, 14.4)
-    x, y = Transformer.from_crs(4326, 32633, always_xy=True).transform(frame.lon_deg, frame.lat_deg)
-    image = write(
-        tmp_path / "map.tif",
-        np.full((3, 400, 400), 90, np.uint8),
-        Affine(0.5, 0, x - 100, 0, -0.5, y + 100),
-        "EPSG:32633",
-    )
     posts = np.full((1, 60, 60), 250.0, np.float32)
     posts[:, :, 30:] = 300.0
     posts[:, 20:40, 20:28] = -9999.0
-    dem = write(tmp_path / "dem.tif", posts, Affine(10, 0, x - 300, 0, -10, y + 300), "EPSG:32633", nodata=-9999.0)
-    ground = open_ground(image, dem, frame)
+    dem = map_rasters.around(tmp_path / "dem.tif", posts, "EPSG:32633", HERE, 10.0, nodata=-9999.0)
+    ground = open_ground(plain(tmp_path / "map.tif"), dem, FRAME)
     assert float(ground.height_amsl_m(np.array(-60.0), np.array(0.0))) == pytest.approx(250.0)
     assert float(ground.height_amsl_m(np.array(60.0), np.array(0.0))) == pytest.approx(300.0)
     assert float(ground.height_amsl_m(np.array(5000.0), np.array(0.0))) == pytest.approx(300.0)  # the edge is extended
 
 
 def test_mistakes_are_one_clear_line(tmp_path: Path) -> None:
-    frame = LocalFrame(48.1, 14.4)
-    x, y = Transformer.from_crs(4326, 32633, always_xy=True).transform(frame.lon_deg, frame.lat_deg)
-    image = write(tmp_path / "map.tif", np.full((3, 64, 64), 90, np.uint8), Affine(0.5, 0, x, 0, -0.5, y), "EPSG:32633")
-    far = write(
-        tmp_path / "far.tif", np.full((1, 64, 64), 90, np.float32), Affine(10, 0, x + 1e5, 0, -10, y), "EPSG:32633"
-    )
+    image = plain(tmp_path / "map.tif", 64)
+    heights = np.full((1, 64, 64), 90, np.float32)
+    far = map_rasters.around(tmp_path / "far.tif", heights, "EPSG:32633", (48.1, 15.7), 10.0)
     with pytest.raises(MapError, match="no such file"):
-        open_ground(tmp_path / "none.tif", None, frame)
+        open_ground(tmp_path / "none.tif", None, FRAME)
     with pytest.raises(MapError, match="no elevation under"):
-        open_ground(image, far, frame)
+        open_ground(image, far, FRAME)
     with pytest.raises(MapError, match="is not near the flight"):
         open_ground(image, None, LocalFrame(-20.0, -120.0))

@@ -9,9 +9,9 @@ import pytest
 from rasterio.transform import Affine
 
 import map_rasters
+from map_packages import centre_of
 from terrafix.anchor.matching.map_layers import MapLayers
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.geodesy import LocalFrame
 from terrafix.map.format import CE90_SIGMAS, Accuracy, Ce90Origin, Layer, accuracy_of
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
@@ -65,8 +65,7 @@ def test_stated_accuracies_are_not_estimated(tmp_path: Path, monkeypatch: pytest
 
 def test_an_offset_is_second_layer_minus_first_layer(tmp_path: Path) -> None:
     opened = package(tmp_path, (2.0, 3.0))
-    west, south, east, north = opened.manifest.bounds_wgs84
-    frame = LocalFrame((south + north) / 2, (west + east) / 2)
+    frame = centre_of(opened)
     found = register(opened.bind(frame, "imagery"), opened.bind(frame, "imagery_2"))
     opened.close()
     assert found is not None
@@ -105,9 +104,8 @@ def test_layers_of_different_ground_give_no_estimate(tmp_path: Path) -> None:
 def test_the_anchor_uses_the_accuracy_of_the_package(tmp_path: Path, ce90_m: float | None, sigma_m: float) -> None:
     built = build_package([layer_of(utm_layer(tmp_path / "i.tif", 1), ce90_m=ce90_m)], tmp_path / "m.gpkg")
     opened = MapPackage.open(built)
-    west, south, east, north = opened.manifest.bounds_wgs84
     camera = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
-    layers = MapLayers(opened, LocalFrame((south + north) / 2, (west + east) / 2), camera, GradientDescriber(), 7.0)
+    layers = MapLayers(opened, centre_of(opened), camera, GradientDescriber(), 7.0)
     assert layers.best.sigma_m == pytest.approx(sigma_m)
     opened.close()
 

@@ -5,7 +5,7 @@ import math
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import map_rasters
+from map_packages import centre_of
 from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
@@ -48,10 +49,16 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build(tif, folder / "m.gpkg", date="2020-01-01", licence="CC0", ce90_m=4.0)
 
 
-def opened_with_frame(path: Path) -> tuple[MapPackage, LocalFrame]:
-    opened = MapPackage.open(path)
-    west, south, east, north = opened.manifest.bounds_wgs84
-    return opened, LocalFrame((south + north) / 2, (west + east) / 2)
+@pytest.fixture
+def opened(package: Path) -> Iterator[MapPackage]:
+    opened = MapPackage.open(package)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def frame(opened: MapPackage) -> LocalFrame:
+    return centre_of(opened)
 
 
 def mission_over(folder: Path, frame: LocalFrame, *places_m: tuple[float, float]) -> Path:
@@ -63,8 +70,7 @@ def mission_over(folder: Path, frame: LocalFrame, *places_m: tuple[float, float]
     return path
 
 
-def test_texture_is_matchable_and_water_and_orchard_rows_are_not(package: Path) -> None:
-    opened, frame = opened_with_frame(package)
+def test_texture_is_matchable_and_water_and_orchard_rows_are_not(opened: MapPackage, frame: LocalFrame) -> None:
     probe = MatchabilityProbe(opened.bind(frame), 1.0, 80.0)
     for n_m in (-60.0, -20.0, 20.0, 60.0):
         assert probe.at(TEXTURE_E_M, n_m)[0] == Sight.SEES
@@ -72,11 +78,9 @@ def test_texture_is_matchable_and_water_and_orchard_rows_are_not(package: Path) 
         assert probe.at(ROWS_E_M, n_m)[0] == Sight.BLIND
     assert probe.at(-600.0, 0.0)[0] == Sight.NO_MAP
     assert probe.at(-500.0, 0.0)[0] == Sight.NO_MAP  # half the frame is beyond the edge
-    opened.close()
 
 
-def test_the_check_grid_and_its_fractions(package: Path) -> None:
-    opened, _ = opened_with_frame(package)
+def test_the_check_grid_and_its_fractions(opened: MapPackage) -> None:
     checked = check(opened)
     report = checked.report
     assert report.sees + report.weak + report.blind == pytest.approx(1.0)
@@ -91,12 +95,12 @@ def test_the_check_grid_and_its_fractions(package: Path) -> None:
     assert any("elevation" in text for text in report.warnings) and not any(
         "accuracy" in text for text in report.warnings
     )
-    opened.close()
 
 
 @pytest.mark.slow
-def test_a_mission_check_lists_the_stretches_without_fixes(tmp_path: Path, package: Path) -> None:
-    opened, frame = opened_with_frame(package)
+def test_a_mission_check_lists_the_stretches_without_fixes(
+    tmp_path: Path, opened: MapPackage, frame: LocalFrame
+) -> None:
     path = mission_over(tmp_path, frame, (-420.0, 0.0), (0.0, 0.0), (0.0, 60.0))
     mission = check(opened, mission=path).report.mission
     assert mission is not None and mission.outside == []
@@ -105,12 +109,10 @@ def test_a_mission_check_lists_the_stretches_without_fixes(tmp_path: Path, packa
     assert longest.length_m == pytest.approx(210, abs=70) and longest.after_item in (0, 1)
     start_e_m, _ = frame.to_local(*longest.start)
     assert start_e_m == pytest.approx(-150, abs=60)  # the lake begins at -175 m
-    opened.close()
 
 
 @pytest.mark.slow
-def test_a_mission_check_lists_where_it_leaves_the_map(tmp_path: Path, package: Path) -> None:
-    opened, frame = opened_with_frame(package)
+def test_a_mission_check_lists_where_it_leaves_the_map(tmp_path: Path, opened: MapPackage, frame: LocalFrame) -> None:
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-400.0, 300.0), (-300.0, 300.0), (-300.0, 0.0))
     report = check(opened, mission=path).report
     assert report.mission is not None
@@ -119,12 +121,10 @@ def test_a_mission_check_lists_where_it_leaves_the_map(tmp_path: Path, package: 
     assert outside.after_item == 1
     assert frame.to_local(*outside.start)[1] == pytest.approx(175 + 10, abs=12)
     assert "after item 1" in dict(lines_of(report))["outside"]
-    opened.close()
 
 
 @pytest.mark.slow
-def test_map_check_fails_with_a_reason(tmp_path: Path, package: Path) -> None:
-    _, frame = opened_with_frame(package)
+def test_map_check_fails_with_a_reason(tmp_path: Path, package: Path, frame: LocalFrame) -> None:
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-400.0, 300.0))
     command = [sys.executable, "-m", "terrafix_tools.cli", "map", "check", str(package), "--mission", str(path)]
     done = subprocess.run([*command, "--json"], capture_output=True, text=True, timeout=120)
@@ -137,8 +137,7 @@ def test_map_check_fails_with_a_reason(tmp_path: Path, package: Path) -> None:
     assert "sees" in done.stdout and "outside" not in done.stdout
 
 
-def test_loiter_and_return_items_are_part_of_the_path(package: Path) -> None:
-    _, frame = opened_with_frame(package)
+def test_loiter_and_return_items_are_part_of_the_path(frame: LocalFrame) -> None:
     home = frame.to_wgs84(-400.0, 0.0)
     there = frame.to_wgs84(-400.0, 100.0)
     items = (
@@ -154,7 +153,7 @@ def test_loiter_and_return_items_are_part_of_the_path(package: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_map_that_is_too_coarse_or_a_height_that_is_too_low_is_reported(tmp_path: Path, package: Path) -> None:
+def test_a_map_that_is_too_coarse_or_a_height_that_is_too_low_is_reported(tmp_path: Path, opened: MapPackage) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=10.0)
     coarse = MapPackage.open(build(tif, tmp_path / "m.gpkg"))
     report = check(coarse, agl_m=120.0).report
@@ -162,20 +161,16 @@ def test_a_map_that_is_too_coarse_or_a_height_that_is_too_low_is_reported(tmp_pa
     assert any("does not say when" in text for text in report.warnings)
     assert any("accuracy is not stated; 10 m" in text for text in report.warnings)
     coarse.close()
-    opened = MapPackage.open(package)
     with pytest.raises(UsageError, match="below 30 m"):
         check(opened, agl_m=20.0)
     with pytest.raises(MapError, match="has no layer"):
         check(opened, layer="summer")
-    opened.close()
 
 
 @pytest.mark.slow
-def test_the_preview_page_needs_no_other_file(tmp_path: Path, package: Path) -> None:
-    opened, frame = opened_with_frame(package)
+def test_the_preview_page_needs_no_other_file(tmp_path: Path, opened: MapPackage, frame: LocalFrame) -> None:
     path = mission_over(tmp_path, frame, (-400.0, 0.0), (-300.0, 0.0))
     text = page(check(opened, mission=path))
-    opened.close()
     assert text.startswith("<!doctype html>") and "The mission stays on this map" in text
     assert not re.findall(r'(?:href|src)="(?!data:)', text) and "http" not in text.replace("http-equiv", "")
     assert text.count("data:image/") == 2 and "<polyline" in text and "m.gpkg" in text

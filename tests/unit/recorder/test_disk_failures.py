@@ -49,13 +49,26 @@ class Usage(NamedTuple):
     free: int
 
 
+Disk = Callable[[int, int], None]
+
+
+def failing(error: int, wait: Callable[[], object] = lambda: None) -> Callable[..., Any]:
+    """-> a function that waits and then fails with this errno, whatever its arguments are."""
+
+    def fail(*_: object, **__: object) -> None:
+        wait()
+        raise OSError(error, os.strerror(error))
+
+    return fail
+
+
 @pytest.fixture
 def clock() -> Clock:
     return Clock()
 
 
 @pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], None]:
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
     """Sets total and free space of the disk, in megabytes."""
 
     def of(total_mb: int, free_mb: int) -> None:
@@ -69,8 +82,8 @@ def ring_in(folder: Path, clock: Clock, budget_mb: int = 64) -> SegmentRing:
     return SegmentRing(folder, header(Config()), budget_mb, clock)
 
 
-def frames_of(folder: Path) -> list[int]:
-    return [message.frame_id for _, _, message in read_flight(folder) if isinstance(message, m.Frame)]
+def frames_of(folder: Path, result: ReadResult | None = None) -> list[int]:
+    return [message.frame_id for _, _, message in read_flight(folder, result) if isinstance(message, m.Frame)]
 
 
 def old_segment(folder: Path, number: int, size: int, modified_s: float) -> Path:
@@ -81,9 +94,7 @@ def old_segment(folder: Path, number: int, size: int, modified_s: float) -> Path
     return path
 
 
-def test_free_space_alone_never_costs_the_record_of_this_flight(
-    tmp_path: Path, clock: Clock, disk: Callable[[int, int], None]
-) -> None:
+def test_free_space_alone_never_costs_the_record_of_this_flight(tmp_path: Path, clock: Clock, disk: Disk) -> None:
     disk(24, 20)
     ring = ring_in(tmp_path, clock)
     ring.write(frame(0), 0)
@@ -102,9 +113,7 @@ def test_free_space_alone_never_costs_the_record_of_this_flight(
     assert frames_of(tmp_path) == [0, 3]
 
 
-def test_the_floor_is_256_mb_or_a_tenth_of_a_small_disk(
-    tmp_path: Path, clock: Clock, disk: Callable[[int, int], None]
-) -> None:
+def test_the_floor_is_256_mb_or_a_tenth_of_a_small_disk(tmp_path: Path, clock: Clock, disk: Disk) -> None:
     for total_mb, free_mb, blocked in [(24, 3, False), (24, 2, True), (100_000, 300, False), (100_000, 200, True)]:
         disk(total_mb, free_mb)
         ring = ring_in(tmp_path, clock)
@@ -115,9 +124,9 @@ def test_the_floor_is_256_mb_or_a_tenth_of_a_small_disk(
 def test_a_flight_starts_on_a_disk_that_takes_no_file_and_is_recorded_when_it_does(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, _: dict[str, str]) -> FlightWriter:
+    def full(path: Path, _: dict[str, str]) -> None:
         path.touch()
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        failing(errno.ENOSPC)()
 
     stream = io.StringIO()
     writer = logs.configure("INFO", "recorder", stream)
@@ -153,12 +162,8 @@ def test_a_disk_that_fails_in_flight_ends_the_segment_and_raises_nothing(
     ring = ring_in(tmp_path, clock)
     ring.write(frame(0), 0)
     ring.flush()
-
-    def fail(*_: object) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
     with monkeypatch.context() as broken:
-        broken.setattr(FlightWriter, method, fail)
+        broken.setattr(FlightWriter, method, failing(errno.EIO))
         ring.write(frame(1), 1)
         ring.write_thumbnail(1, 1, b"x")
         ring.write_frame_image(1, 1, b"x", "png")
@@ -317,14 +322,9 @@ def test_a_late_error_of_the_synchronisation_of_an_ended_file_does_not_end_the_n
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     goes_on = threading.Event()
-
-    def fail(_: FlightWriter) -> None:
-        goes_on.wait(5.0)
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
     ring = ring_in(tmp_path, clock)
     with monkeypatch.context() as broken:
-        broken.setattr(FlightWriter, "sync", fail)
+        broken.setattr(FlightWriter, "sync", failing(errno.EIO, lambda: goes_on.wait(5.0)))
         clock.now_s += FSYNC_S
         ring.flush()
         ring.write(frame(0), SEGMENT_NS + 1)
@@ -386,7 +386,7 @@ def test_other_flights_make_room_when_the_disk_is_at_its_floor(
 
 
 def test_the_counts_of_lost_messages_are_recorded_when_the_disk_is_back(
-    tmp_path: Path, clock: Clock, disk: Callable[[int, int], None]
+    tmp_path: Path, clock: Clock, disk: Disk
 ) -> None:
     disk(24, 1)
     ring = ring_in(tmp_path, clock)
@@ -410,10 +410,7 @@ def test_the_counts_of_lost_messages_are_recorded_when_the_disk_is_back(
 def test_the_supervisor_starts_on_a_broken_disk_and_not_on_a_wrong_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, flies: bool
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise OSError(error, os.strerror(error))
-
-    monkeypatch.setattr("tempfile.TemporaryFile", fail)
+    monkeypatch.setattr("tempfile.TemporaryFile", failing(error))
     if flies:
         assert _writable(tmp_path / "out") == tmp_path / "out"
     else:
@@ -460,11 +457,6 @@ def test_after_a_damaged_chunk_the_rest_of_the_file_is_read(tmp_path: Path) -> N
     data[middle] ^= 0xFF
     path.write_bytes(data)
     result = ReadResult()
-    assert [message.frame_id for _, _, message in read_flight(path, result) if isinstance(message, m.Frame)] == [
-        0,
-        1,
-        3,
-        4,
-    ]
+    assert frames_of(path, result) == [0, 1, 3, 4]
     (damage,) = result.damaged
     assert damage.startswith(f"flight.mcap, byte {places[2]}: ") and not result.truncated_files

@@ -19,6 +19,7 @@ from mcap.reader import make_reader
 
 from flight_records import ORIGIN, PERIOD_NS, estimate, live_messages, origin, write_record
 from terrafix import messages as m
+from terrafix.core.log_lines import MessageLog
 from terrafix.recorder import foxglove
 from terrafix.recorder.foxglove import CHANNELS, FoxgloveMessages, Level, Stamped
 
@@ -119,109 +120,17 @@ def test_recorded_image_is_base64_of_the_file(recorded: dict[str, list[tuple[str
 
 
 @pytest.mark.parametrize(
-    ("severity", "level"),
+    ("message", "level"),
     [
-        (0, Level.WARNING),
-        (2, Level.WARNING),
-        (4, Level.WARNING),
-        (5, Level.INFO),
-        (6, Level.INFO),
-        (7, Level.DEBUG),
-        (9, Level.INFO),
-        (-1, Level.WARNING),
+        (m.StatusText(t_ns=7, severity=7, text="no map fix"), Level.DEBUG),
+        (m.StatusText(t_ns=7, severity=5, text="no map fix"), Level.INFO),
+        (m.SearchState(t_ns=7, step=m.SearchStep.WHOLE_MAP), Level.WARNING),
+        (m.ModelEvent(t_ns=7, model="a", change=m.ModelChange.GIVEN_UP, provider="CPU", detail=""), Level.ERROR),
     ],
 )
-def test_texts_for_the_pilot_are_logged_by_severity(severity: int, level: Level) -> None:
-    assert logged(m.StatusText(t_ns=7, severity=severity, text="no map fix")) == (
-        level, "pilot", f"text to the pilot, text no map fix, severity {severity}")  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("event", "level"),
-    [
-        ("started", Level.INFO),
-        ("died", Level.WARNING),
-        ("stuck", Level.WARNING),
-        ("restarted", Level.WARNING),
-        ("gave_up", Level.ERROR),
-        ("stopped", Level.INFO),
-    ],
-)
-def test_process_events_are_logged(event: str, level: Level) -> None:
-    message = m.ProcessEvent(t_ns=7, process="anchor", event=event, detail="signal 9")
-    found, part, text = logged(message)
-    assert (found, part) == (level, "supervisor") and text.startswith(f"process {event}, child anchor, detail signal 9")
-
-
-@pytest.mark.parametrize(
-    ("change", "level"),
-    [
-        (m.ModelChange.OPENED, Level.INFO),
-        (m.ModelChange.RESUMED, Level.INFO),
-        (m.ModelChange.PROVIDER, Level.WARNING),
-        (m.ModelChange.SUSPENDED, Level.WARNING),
-        (m.ModelChange.FAILED, Level.WARNING),
-        (m.ModelChange.GIVEN_UP, Level.ERROR),
-    ],
-)
-def test_model_events_are_logged(change: m.ModelChange, level: Level) -> None:
-    message = m.ModelEvent(t_ns=7, model="xfeat", change=change, provider="CPU", detail="sha256 12")
-    found, part, text = logged(message)
-    assert (found, part) == (level, "xfeat")
-    assert text.startswith(f"learned model, model xfeat, change {change.value}, provider CPU, detail sha256 12")
-
-
-@pytest.mark.parametrize(
-    ("message", "expected"),
-    [
-        (
-            m.CalibrationFault(t_ns=7, quantity="scale", factor=1.2, detail="20 % too high", active=True),
-            (Level.WARNING, "calibration", "calibration fault, quantity scale, factor 1.2, detail 20 % too high"),
-        ),
-        (
-            m.CalibrationFault(t_ns=7, quantity="scale", factor=None, detail="", active=False),
-            (Level.INFO, "calibration", "calibration fault ended, quantity scale"),
-        ),
-        (
-            m.HintVerdict(
-                t_ns=7, hint_t_ns=1, verdict=m.Verdict.ACCEPTED, distance_m=None, sigma_m=None, text="search begins"
-            ),
-            (Level.INFO, "hint", "position hint, verdict accepted, text search begins"),
-        ),
-        (
-            m.HintVerdict(
-                t_ns=7, hint_t_ns=1, verdict=m.Verdict.OUTSIDE_MAP, distance_m=None, sigma_m=None, text="not on the map"
-            ),
-            (Level.WARNING, "hint", "position hint, verdict outside_map, text not on the map"),
-        ),
-        (m.SearchState(t_ns=7, step=m.SearchStep.WHOLE_MAP), (Level.WARNING, "search", "search step, step whole_map")),
-        (
-            m.Dropped(t_ns=7, process="link", message="Imu", count=3),
-            (Level.WARNING, "link", "messages lost, message Imu, count 3"),
-        ),
-        (
-            m.PositionSource(t_ns=7, vision=True, receiver=0),
-            (Level.WARNING, "link", "the autopilot is to navigate by another position, position Terrafix"),
-        ),
-        (
-            m.PositionSource(t_ns=7, vision=False, receiver=1),
-            (Level.WARNING, "link", "the autopilot is to navigate by another position, position GNSS receiver 1"),
-        ),
-        (
-            m.MeasurementVerdict(
-                t_ns=7, frame_id=4, measurement="map", verdict=m.Verdict.INNOVATION, detail="12 m off"
-            ),
-            (Level.DEBUG, "map", "measurement rejected, verdict innovation, frame 4, detail 12 m off"),
-        ),
-        (
-            m.MeasurementVerdict(t_ns=7, frame_id=-1, measurement="height", verdict=m.Verdict.IMPLAUSIBLE),
-            (Level.DEBUG, "height", "measurement rejected, verdict implausible"),
-        ),
-    ],
-    ids=lambda value: type(value).__name__,
-)
-def test_what_happens_is_logged_with_its_level(message: m.Message, expected: tuple[Level, str, str]) -> None:
-    assert logged(message) == expected
+def test_a_line_of_the_log_has_the_level_of_foxglove(message: m.Message, level: Level) -> None:
+    entry = MessageLog().entry(message)
+    assert entry is not None and logged(message) == (level, entry.part, entry.text)
 
 
 def test_a_line_of_the_log_of_a_process_is_recorded_with_its_fields() -> None:

@@ -7,19 +7,19 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 import zmq
 
 from gps_messages import GPS
-from runtime_nodes import ORIGIN
+from runtime_nodes import ORIGIN, frame, prediction
 from terrafix import messages as m
 from terrafix.core import logs
-from terrafix.core.node import Edge
+from terrafix.core.node import Edge, Node
 from terrafix.processes import ALL_MESSAGES, Process
-from terrafix.runtime import bus
-from terrafix.runtime.bus import Publisher, Subscriber
+from terrafix.runtime.bus import QUEUE_LENGTH, Publisher, Subscriber
 from terrafix.runtime.executor import LiveShell
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
@@ -27,19 +27,41 @@ from terrafix.runtime.run_dir import RunDir
 pytestmark = pytest.mark.real_time
 
 
-@pytest.fixture
-def context() -> Iterator["zmq.Context[zmq.Socket[bytes]]"]:
-    with zmq.Context() as zmq_context:
-        yield zmq_context
+Context = zmq.Context[zmq.Socket[bytes]]
+
+
+class Bus:
+    """Publishers and subscribers of a run, which the fixture closes."""
+
+    def __init__(self, context: Context, run_dir: RunDir) -> None:
+        self.context, self.run_dir = context, run_dir
+        self._open: list[Publisher | Subscriber] = []
+
+    def publisher(self, process: str, **options: Any) -> Publisher:
+        publisher = Publisher(self.context, self.run_dir.address(process), **options)
+        self._open.append(publisher)
+        return publisher
+
+    def subscriber(self, process: str, *kinds: type[m.Message]) -> Subscriber:
+        subscriber = Subscriber(self.context, [self.run_dir.address(process)], kinds)
+        self._open.append(subscriber)
+        return subscriber
+
+    def shell(self, process: Process, others: tuple[Process, ...], node: Node, edge: Edge | None = None) -> LiveShell:
+        Progress.create(self.run_dir.progress(process.name)).close()
+        return LiveShell(process, (process, *others), node, edge, self.run_dir, self.context)
+
+    def close(self) -> None:
+        for side in self._open:
+            side.close()
 
 
 @pytest.fixture
-def run_dir(tmp_path_factory: pytest.TempPathFactory) -> RunDir:
-    return RunDir(tmp_path_factory.mktemp("r"))
-
-
-def frame(frame_id: int) -> m.Frame:
-    return m.Frame(t_ns=frame_id, frame_id=frame_id, file="", width=1, height=1)
+def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
+    with zmq.Context() as context:
+        bus = Bus(context, RunDir(tmp_path_factory.mktemp("r")))
+        yield bus
+        bus.close()
 
 
 def collect(subscriber: Subscriber, publisher: Publisher, until: Callable[[list[m.Message]], bool]) -> list[m.Message]:
@@ -54,90 +76,69 @@ def collect(subscriber: Subscriber, publisher: Publisher, until: Callable[[list[
     return got
 
 
-def test_late_subscribers_get_the_retained_origin_and_others_do_not_get_it_twice(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
-    address = run_dir.address("vision")
-    early = Subscriber(context, [address], (m.Origin, m.Frame))  # before there is a publisher
-    publisher = Publisher(context, address)
+def test_late_subscribers_get_the_retained_origin_and_others_do_not_get_it_twice(bus: Bus) -> None:
+    early = bus.subscriber("vision", m.Origin, m.Frame)  # before there is a publisher
+    publisher = bus.publisher("vision")
     collect(early, publisher, lambda _: publisher.subscriptions(m.Origin) == 1)
     for message in (ORIGIN, frame(1)):
         publisher.publish(message)
     assert collect(early, publisher, lambda got: len(got) == 2) == [ORIGIN, frame(1)]
-    late = Subscriber(context, [address], (m.Origin, m.Frame))
+    late = bus.subscriber("vision", m.Origin, m.Frame)
     assert collect(late, publisher, bool) == [ORIGIN]
     publisher.publish(frame(2))
     assert collect(late, publisher, bool) == [frame(2)], "messages that are not retained are not sent again"
     assert collect(early, publisher, bool) == [frame(2)], "the second Origin is discarded by its sequence number"
     assert not early.lost and not late.lost, "messages before the subscription are not losses"
-    for side in (early, late, publisher):
-        side.close()
 
 
-def test_process_events_are_retained_for_ten_seconds(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
+def test_process_events_are_retained_for_ten_seconds(bus: Bus) -> None:
     clock_ns = [0]
-    publisher = Publisher(context, run_dir.address("supervisor"), clock=lambda: clock_ns[0])
+    publisher = bus.publisher("supervisor", clock=lambda: clock_ns[0])
     for second in (0, 15, 16):
         clock_ns[0] = second * 1_000_000_000
         publisher.publish(m.ProcessEvent(t_ns=clock_ns[0], process="anchor", event="died"))
     clock_ns[0] = 20_000_000_000
-    late = Subscriber(context, [run_dir.address("supervisor")], (m.ProcessEvent,))
+    late = bus.subscriber("supervisor", m.ProcessEvent)
     got = collect(late, publisher, lambda got: len(got) == 2)
     assert [e.t_ns for e in got] == [15_000_000_000, 16_000_000_000]
-    late.close()
-    publisher.close()
 
 
-def test_gps_input_is_retained_until_the_recorder_has_subscribed(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
-    address = run_dir.address("link")
-    publisher = Publisher(context, address)
-    status = Subscriber(context, [address], (m.GpsInput,))  # of another program, which is not the recorder
+def test_gps_input_is_retained_until_the_recorder_has_subscribed(bus: Bus) -> None:
+    publisher = bus.publisher("link")
+    status = bus.subscriber("link", m.GpsInput)  # of another program, which is not the recorder
     collect(status, publisher, lambda _: publisher.subscriptions(m.GpsInput) == 1)
     early = [msgspec.structs.replace(GPS, t_ns=t_ns) for t_ns in (1, 2)]
     for gps in early:
         publisher.publish(gps)
-    recorder = Subscriber(context, [address], (m.GpsInput, m.InputOrder))
+    recorder = bus.subscriber("link", m.GpsInput, m.InputOrder)
     assert collect(recorder, publisher, lambda got: len(got) == 2) == early
     collect(recorder, publisher, lambda _: publisher.subscriptions(m.InputOrder) == 1)
     later = msgspec.structs.replace(GPS, t_ns=3)
     publisher.publish(later)
     assert collect(recorder, publisher, bool) == [later]
     assert collect(status, publisher, lambda got: len(got) == 3) == [*early, later]
-    restarted = Subscriber(context, [address], (m.GpsInput, m.InputOrder))
+    restarted = bus.subscriber("link", m.GpsInput, m.InputOrder)
     assert later not in collect(restarted, publisher, lambda got: len(got) == 2)
-    for side in (status, recorder, restarted, publisher):
-        side.close()
 
 
-def test_subscribers_reconnect_to_a_restarted_publisher_and_receive_its_origin(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
-    address = run_dir.address("vision")
-    subscriber = Subscriber(context, [address], (m.Origin,))
-    first = Publisher(context, address)
+def test_subscribers_reconnect_to_a_restarted_publisher_and_receive_its_origin(bus: Bus) -> None:
+    subscriber = bus.subscriber("vision", m.Origin)
+    first = bus.publisher("vision")
     first.publish(ORIGIN)
     assert collect(subscriber, first, bool) == [ORIGIN]
     first.close()
     started = time.monotonic()
-    second = Publisher(context, address)
+    second = bus.publisher("vision")
     second.publish(ORIGIN)
     assert collect(subscriber, second, bool) == [ORIGIN]
     assert time.monotonic() - started < 1.0
-    subscriber.close()
-    second.close()
 
 
-def test_messages_lost_by_a_slow_subscriber_are_counted_and_publishing_does_not_block(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
-    publisher = Publisher(context, run_dir.address("vision"))
-    slow = Subscriber(context, [run_dir.address("vision")], (m.Frame,))
+def test_messages_lost_by_a_slow_subscriber_are_counted_and_publishing_does_not_block(bus: Bus) -> None:
+    publisher = bus.publisher("vision")
+    slow = bus.subscriber("vision", m.Frame)
     collect(slow, publisher, lambda _: publisher.subscriptions(m.Frame) == 1)
-    total = 6 * bus.QUEUE_LENGTH
+    total = 6 * QUEUE_LENGTH
     started = time.monotonic()
     for i in range(total):
         publisher.publish(frame(i))
@@ -155,8 +156,6 @@ def test_messages_lost_by_a_slow_subscriber_are_counted_and_publishing_does_not_
         got += len(list(slow.receive()))
     assert got < total
     assert got + slow.lost["Frame"] == total
-    slow.close()
-    publisher.close()
 
 
 class SlowNode:
@@ -182,30 +181,13 @@ PUBLISHER = Process("publisher", "", (), (m.Prediction,), 0.0, 1.0)
 LISTENER = Process("listener", "", ALL_MESSAGES, (), 0.0, 1.0)
 
 
-def prediction(frame_id: int) -> m.Prediction:
-    return m.Prediction(
-        t_ns=0,
-        frame_id=frame_id,
-        p_c_in_w_m=(0.0, 0.0, 0.0),
-        q_w_c=(1.0, 0.0, 0.0, 0.0),
-        cov=(0.0,) * 36,
-        agl_m=1.0,
-        agl_sigma_m=1.0,
-        step_m=(1.0, 0.0),
-        step_cov_m2=(1.0, 0.0, 0.0, 1.0),
-    )
-
-
 @pytest.mark.slow
-def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_ones(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
-    table = (SLOW, PUBLISHER, LISTENER)
-    progress = Progress.create(run_dir.progress("slow"))
+def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_ones(bus: Bus) -> None:
     stop = threading.Event()
-    shell = LiveShell(SLOW, table, SlowNode(), None, run_dir, context)
-    publisher = Publisher(context, run_dir.address("publisher"))
-    listener = Subscriber(context, [run_dir.address("slow")], ALL_MESSAGES)
+    shell = bus.shell(SLOW, (PUBLISHER, LISTENER), SlowNode())
+    progress = Progress(bus.run_dir.progress("slow"))
+    publisher = bus.publisher("publisher")
+    listener = bus.subscriber("slow", *ALL_MESSAGES)
     thread = threading.Thread(target=shell.run, args=(stop.is_set,))
     thread.start()
     received: list[m.Message] = []
@@ -215,7 +197,7 @@ def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_on
             time.sleep(0.01)
         time.sleep(0.1)
         for i in range(100):
-            publisher.publish(prediction(i))
+            publisher.publish(prediction(i, 1.0, 0.0))
             time.sleep(0.015)
         deadline = time.monotonic() + 5
         while not any(isinstance(h, m.MapMatch) and h.frame_id == 99 for h in received) and time.monotonic() < deadline:
@@ -236,8 +218,8 @@ def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_on
     assert {(d.process, d.message) for d in dropped} == {("slow", "Prediction")}
     assert sum(d.count for d in dropped) == 100 - len(matches)
     assert progress.stamp_ns > 0 and progress.idle
-    for side in (shell, publisher, listener, progress):
-        side.close()
+    shell.close()
+    progress.close()
 
 
 class TickingNode:
@@ -272,14 +254,9 @@ class OneFrameEdge:
         self.closed = True
 
 
-def test_ticks_keep_the_time_grid_and_the_edge_is_polled_and_closed(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
-    process = Process("ticking", "", (), (m.Frame,), 50.0, 1.0)
-    Progress.create(run_dir.progress("ticking")).close()
+def test_ticks_keep_the_time_grid_and_the_edge_is_polled_and_closed(bus: Bus) -> None:
     node, edge = TickingNode(), OneFrameEdge()
-    as_edge: Edge = edge
-    shell = LiveShell(process, (process,), node, as_edge, run_dir, context)
+    shell = bus.shell(Process("ticking", "", (), (m.Frame,), 50.0, 1.0), (), node, edge)
     until = time.monotonic() + 1.0
     shell.run(lambda: time.monotonic() > until)
     shell.close()
@@ -310,15 +287,13 @@ def test_addresses_are_short_enough_for_unix_sockets() -> None:
     assert len(os.fsencode(longest)) < 107
 
 
-def test_a_subscriber_that_joins_a_busy_stream_receives_retained_messages_first(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
+def test_a_subscriber_that_joins_a_busy_stream_receives_retained_messages_first(bus: Bus) -> None:
     """A subscription may arrive during a send: without XPUB_MANUAL thirty of a thousand late subscribers received a
     frame before Origin."""
     over = threading.Event()
 
     def publish_frames() -> None:
-        publisher = Publisher(context, run_dir.address("vision"))
+        publisher = bus.publisher("vision")
         publisher.publish(ORIGIN)
         count = 0
         while not over.is_set():
@@ -330,7 +305,7 @@ def test_a_subscriber_that_joins_a_busy_stream_receives_retained_messages_first(
     thread.start()
     try:
         for _ in range(500):
-            late = Subscriber(context, [run_dir.address("vision")], (m.Origin, m.Frame))
+            late = bus.subscriber("vision", m.Origin, m.Frame)
             assert late.socket.poll(5000), "no message was received"
             assert next(late.receive()) == ORIGIN
             late.socket.close()
@@ -341,18 +316,16 @@ def test_a_subscriber_that_joins_a_busy_stream_receives_retained_messages_first(
 
 @pytest.mark.parametrize("late_s", [0.05, None], ids=["a late recorder", "no recorder"])
 def test_a_started_process_waits_for_the_recorder_so_that_its_first_message_is_recorded(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir, late_s: float | None
+    bus: Bus, late_s: float | None
 ) -> None:
-    process = Process("started", "", (), (m.Frame,), 0.0, 1.0)
-    Progress.create(run_dir.progress("started")).close()
-    shell = LiveShell(process, (process, LISTENER), TickingNode(), OneFrameEdge(), run_dir, context)
+    shell = bus.shell(Process("started", "", (), (m.Frame,), 0.0, 1.0), (LISTENER,), TickingNode(), OneFrameEdge())
     over = threading.Event()
     began_s = time.monotonic()
     thread = threading.Thread(target=shell.run, args=(over.is_set,))
     thread.start()
     try:
         time.sleep(late_s or 0.5)
-        recorder = Subscriber(context, [run_dir.address("started")], (m.Frame, m.InputOrder))
+        recorder = bus.subscriber("started", m.Frame, m.InputOrder)
         arrived = recorder.socket.poll(1000)
         assert [*recorder.receive()] == ([frame(1)] if late_s else []), "without a recorder it goes on"
         assert not late_s or (arrived and time.monotonic() - began_s < 1.0)
@@ -373,15 +346,11 @@ class LoggingEdge(OneFrameEdge):
             yield msgspec.structs.replace(frame(1), error="no answer")
 
 
-def test_lines_of_the_log_that_no_message_says_are_published_and_those_of_messages_are_not(
-    context: "zmq.Context[zmq.Socket[bytes]]", run_dir: RunDir
-) -> None:
-    process = Process("logging", "", (), (m.Frame,), 0.0, 1.0)
-    Progress.create(run_dir.progress("logging")).close()
+def test_lines_of_the_log_that_no_message_says_are_published_and_those_of_messages_are_not(bus: Bus) -> None:
     stream = io.StringIO()
     writer = logs.configure("INFO", "logging", stream)
     edge = LoggingEdge()
-    shell = LiveShell(process, (process, LISTENER), TickingNode(), edge, run_dir, context)
+    shell = bus.shell(Process("logging", "", (), (m.Frame,), 0.0, 1.0), (LISTENER,), TickingNode(), edge)
     until = time.monotonic() + 0.6
     shell.run(lambda: time.monotonic() > until)
     shell.close()

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from runtime_nodes import ORIGIN
+from runtime_nodes import ORIGIN, frame, prediction
 from terrafix import messages as m
 from terrafix.core import codec
 from terrafix.core.clock import Ticker
@@ -15,26 +15,8 @@ from terrafix.runtime.inbox import Inbox
 from terrafix_tools.in_process import InProcessShell
 
 
-def frame(frame_id: int) -> m.Frame:
-    return m.Frame(t_ns=frame_id, frame_id=frame_id, file="", width=1, height=1)
-
-
 def verdict(frame_id: int, measurement: str) -> m.MeasurementVerdict:
     return m.MeasurementVerdict(t_ns=0, frame_id=frame_id, measurement=measurement, verdict=m.Verdict.ACCEPTED)
-
-
-def prediction(frame_id: int, east_m: float, north_m: float) -> m.Prediction:
-    return m.Prediction(
-        t_ns=frame_id,
-        frame_id=frame_id,
-        p_c_in_w_m=(0.0, 0.0, 100.0),
-        q_w_c=(1.0, 0.0, 0.0, 0.0),
-        cov=(1.0,) * 36,
-        agl_m=100.0,
-        agl_sigma_m=2.0,
-        step_m=(east_m, north_m),
-        step_cov_m2=(1.0, 0.5, 0.5, 2.0),
-    )
 
 
 def status(now_ns: int) -> m.LinkStatus:

@@ -86,6 +86,9 @@ class Flight:
     def names(self, process: str) -> list[str]:
         return [e.event for e in self.events if e.process == process]
 
+    def all_started(self) -> None:
+        eventually(lambda: len([e for e in self.events if e.event == "started"]) == len(TABLE), within_s=10)
+
     def stop(self) -> None:
         self._stop.set()
         self._thread.join(30)
@@ -232,6 +235,12 @@ def children_of(pid: int) -> dict[str, int]:
     return pids
 
 
+def started(process: "subprocess.Popen[str]") -> dict[str, int]:
+    """-> ``children_of`` a supervisor, when it has all processes of the table."""
+    eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
+    return children_of(process.pid)
+
+
 def is_gone(pid: int) -> bool:
     """Whether the process has ended; it may still be a zombie."""
     try:
@@ -297,8 +306,7 @@ def test_processes_of_a_killed_supervisor_fly_on_and_the_next_one_adopts_restart
     others = {run.path for run in run_dir.live_runs()}
     try:
         with supervisor_process(tmp_path / "out") as process:
-            eventually(lambda: names <= set(children_of(process.pid)), 15)
-            pids = {name: pid for name, pid in children_of(process.pid).items() if name in names}
+            pids = {name: pid for name, pid in started(process).items() if name in names}
             (folder,) = (run for run in run_dir.live_runs() if run.path not in others)
             eventually(folder.was_alive_recently, 15)
             process.kill()
@@ -322,11 +330,9 @@ def test_processes_of_a_killed_supervisor_fly_on_and_the_next_one_adopts_restart
 def test_processes_of_a_recorded_source_end_with_a_killed_supervisor_and_its_folder_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = {p.name for p in TABLE}
     others = {run.path for run in run_dir.live_runs()}
     with supervisor_process(tmp_path / "out", SOURCE=str(tmp_path)) as process:
-        eventually(lambda: names <= set(children_of(process.pid)), 15)
-        children = children_of(process.pid)
+        children = started(process)
         (folder,) = {run.path for run in run_dir.live_runs()} - others
         eventually(run_dir.RunDir(folder).was_alive_recently, 15)
         process.kill()
@@ -344,7 +350,7 @@ def test_processes_of_a_recorded_source_end_with_a_killed_supervisor_and_its_fol
 
 def test_simultaneous_signals_do_not_deadlock(tmp_path: Path) -> None:
     with supervisor_process(tmp_path / "out") as process:
-        eventually(lambda: {p.name for p in TABLE} <= set(children_of(process.pid)), 15)
+        started(process)
         until_s = time.monotonic() + 0.5
         while time.monotonic() < until_s and process.poll() is None:
             process.send_signal(signal.SIGINT)
@@ -355,8 +361,7 @@ def test_simultaneous_signals_do_not_deadlock(tmp_path: Path) -> None:
 def test_a_killed_fork_server_ends_no_process_and_is_restarted_at_the_next_request(tmp_path: Path) -> None:
     names = {p.name for p in TABLE}
     with supervisor_process(tmp_path / "out") as process:
-        eventually(lambda: names <= set(children_of(process.pid)), 15)
-        before = children_of(process.pid)
+        before = started(process)
         (fork_server,) = (pid for name, pid in before.items() if name not in names)
         os.kill(fork_server, signal.SIGKILL)
         os.kill(before["estimator"], signal.SIGKILL)
@@ -414,7 +419,7 @@ def test_exit_codes_are_described_as_text() -> None:
 def test_all_processes_keep_to_the_cores_of_the_budget(tmp_path: Path) -> None:
     first = min(os.sched_getaffinity(0))
     with flight(tmp_path, more_config="[runtime]\ncores = 1\n") as f:
-        eventually(lambda: len([e for e in f.events if e.event == "started"]) == len(TABLE), within_s=10)
+        f.all_started()
         eventually(lambda: all(os.sched_getaffinity(f.pid(process.name)) == {first} for process in TABLE), within_s=10)
 
 
@@ -425,7 +430,7 @@ def priorities(f: Flight, own: int) -> dict[str, int]:
 def test_a_process_has_the_priority_of_the_table(tmp_path: Path) -> None:
     own = os.getpriority(os.PRIO_PROCESS, 0)
     with flight(tmp_path) as f:
-        eventually(lambda: len([e for e in f.events if e.event == "started"]) == len(TABLE), within_s=10)
+        f.all_started()
         eventually(lambda: priorities(f, own) == {"recorder": 0, "link": 0, "estimator": 3, "vision": 0}, within_s=10)
 
 

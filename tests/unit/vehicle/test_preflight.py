@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 import map_rasters
+from map_packages import centre_of
 from preflight_autopilot import GroundAutopilot
 from terrafix.core.config import Config, HealthSection, LinkSection, Models, RecorderSection
 from terrafix.core.config import Map as MapSection
 from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import LinkError, UsageError
-from terrafix.core.geodesy import LocalFrame
 from terrafix.core.signature import generate
 from terrafix.link.gnss.previous_source import PreviousSource, PreviousSourceFile
 from terrafix.link.mavlink.transport import Address, Chunk
-from terrafix.map.package import MapPackage
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
@@ -91,15 +91,12 @@ def lines_by_check(values: dict[str, float], at: Context) -> dict[str, Line]:
 # --- rules and presets ---
 
 
-@pytest.mark.parametrize("name", ["plane", "copter"])
-def test_the_presets_pass_all_rules(name: str) -> None:
-    lines = lines_by_check(DEFAULTS | preset(name), context(plane=name == "plane"))
-    assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
-
-
-@pytest.mark.parametrize("plane", [False, True])
-def test_the_preset_with_a_real_receiver_passes_all_rules(plane: bool) -> None:
-    lines = lines_by_check(DEFAULTS | preset("second-gps"), context(plane=plane, gps_id=1))
+@pytest.mark.parametrize(
+    ("name", "plane", "gps_id"),
+    [("plane", True, 0), ("copter", False, 0), ("second-gps", True, 1), ("second-gps", False, 1)],
+)
+def test_the_presets_pass_all_rules(name: str, plane: bool, gps_id: int) -> None:
+    lines = lines_by_check(DEFAULTS | preset(name), context(plane=plane, gps_id=gps_id))
     assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
 
 
@@ -184,68 +181,59 @@ def test_the_firmware_version_comes_from_autopilot_version(monkeypatch: pytest.M
     assert firmwares == [(4, 6), (4, 7)]
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "status", "says"),
-    [
-        ("GPS1_TYPE", 1, "fail", "set 14"),
-        ("GPS1_DELAY_MS", 0, "fail", "200 ms"),
-        ("GPS1_DELAY_MS", 220, "fail", "moment of sending"),
-        ("EK3_GPS_CHECK", 31, "fail", "set 23"),
-        ("EK3_VELNE_M_NSE", 0.3, "fail", "failsafe"),
-        ("EK3_VELNE_M_NSE", 1.5, "fail", "does not align"),
-        ("EK3_SRC1_VELXY", 0, "fail", "velocity is sent"),
-        ("EK3_SRC1_POSZ", 3, "warn", "barometer"),
-        ("EK3_SRC1_YAW", 2, "fail", "no yaw"),
-        ("AHRS_OPTIONS", 2, "warn", "set 3"),
-        ("ARSPD_USE", 0, "warn", "170 m"),
-        ("EK3_CHECK_SCALE", 50, "warn", "set 100"),
-        ("EK3_SRC1_VELZ", 0, "warn", "set 3"),
-        ("EK3_POSNE_M_NSE", 5.0, "warn", "set 0.5"),
-        ("EK3_GLITCH_RAD", 0, "warn", "clipped"),
-        ("GPS1_POS_X", 0.4, "warn", "antenna"),
-        ("GPS2_TYPE", 14, "fail", "both GPS"),
-    ],
-)
-def test_each_wrong_value_has_a_reason_and_a_fix(name: str, value: float, status: str, says: str) -> None:
-    line = lines_by_check(DEFAULTS | preset("plane") | {name: value}, context())[name]
+WRONG = [
+    ("plane", {"GPS1_TYPE": 1}, "GPS1_TYPE", "fail", "set 14"),
+    ("plane", {"GPS1_DELAY_MS": 0}, "GPS1_DELAY_MS", "fail", "200 ms"),
+    ("plane", {"GPS1_DELAY_MS": 220}, "GPS1_DELAY_MS", "fail", "moment of sending"),
+    ("plane", {"EK3_GPS_CHECK": 31}, "EK3_GPS_CHECK", "fail", "set 23"),
+    ("plane", {"EK3_VELNE_M_NSE": 0.3}, "EK3_VELNE_M_NSE", "fail", "failsafe"),
+    ("plane", {"EK3_VELNE_M_NSE": 1.5}, "EK3_VELNE_M_NSE", "fail", "does not align"),
+    ("plane", {"EK3_SRC1_VELXY": 0}, "EK3_SRC1_VELXY", "fail", "velocity is sent"),
+    ("plane", {"EK3_SRC1_POSZ": 3}, "EK3_SRC1_POSZ", "warn", "barometer"),
+    ("plane", {"EK3_SRC1_YAW": 2}, "EK3_SRC1_YAW", "fail", "no yaw"),
+    ("plane", {"AHRS_OPTIONS": 2}, "AHRS_OPTIONS", "warn", "set 3"),
+    ("plane", {"ARSPD_USE": 0}, "ARSPD_USE", "warn", "170 m"),
+    ("plane", {"EK3_CHECK_SCALE": 50}, "EK3_CHECK_SCALE", "warn", "set 100"),
+    ("plane", {"EK3_SRC1_VELZ": 0}, "EK3_SRC1_VELZ", "warn", "set 3"),
+    ("plane", {"EK3_POSNE_M_NSE": 5.0}, "EK3_POSNE_M_NSE", "warn", "set 0.5"),
+    ("plane", {"EK3_GLITCH_RAD": 0}, "EK3_GLITCH_RAD", "warn", "clipped"),
+    ("plane", {"GPS1_POS_X": 0.4}, "GPS1_POS_X", "warn", "antenna"),
+    ("plane", {"GPS2_TYPE": 14}, "GPS2_TYPE", "fail", "both GPS"),
+    ("plane", {"EK3_SRC2_VELXY": 6}, "EK3_SRC_OPTIONS", "warn", "set 0"),  # another source set has a velocity
+    ("copter", {"FS_EKF_ACTION": 0}, "FS_EKF_ACTION", "warn", "drifts on"),
+    ("second-gps", {"GPS_AUTO_SWITCH": 2}, "GPS_AUTO_SWITCH", "warn", "set 4"),  # it blends both
+    ("second-gps", {"GPS_AUTO_SWITCH": 0}, "GPS_AUTO_SWITCH", "warn", "set 4"),  # left by a flight on Terrafix
+    ("second-gps", {"GPS_PRIMARY": 1}, "GPS_PRIMARY", "warn", "set 0"),
+    ("second-gps", {"ARMING_CHECK": 1}, "ARMING_CHECK", "warn", ""),
+]
+
+
+@pytest.mark.parametrize(("name", "changed", "check", "status", "says"), WRONG)
+def test_each_wrong_value_has_a_reason_and_a_fix(
+    name: str, changed: dict[str, float], check: str, status: str, says: str
+) -> None:
+    at = context(plane=name != "copter", gps_id=int(name == "second-gps"))
+    line = lines_by_check(DEFAULTS | preset(name) | changed, at)[check]
     assert line.status == status
     assert says in f"{line.text} {line.fix}"
     assert (line.change is not None) or not line.fix
 
 
+@pytest.mark.parametrize(
+    ("name", "check"),
+    [
+        pytest.param("plane", "FS_EKF_ACTION", id="only a copter has a failsafe action"),
+        pytest.param("plane", "EK3_SRC_OPTIONS", id="no other source set has a velocity"),
+        pytest.param("plane", "GPS_AUTO_SWITCH", id="there is no other receiver"),
+    ],
+)
+def test_a_rule_that_does_not_apply_has_no_line(name: str, check: str) -> None:
+    assert check not in lines_by_check(DEFAULTS | preset(name), context())
+
+
 @pytest.mark.parametrize(("value", "text"), [(1048566.0, "1048566"), (0.8999999761581421, "0.9"), (-1.0, "-1")])
 def test_parameter_values_are_formatted_without_loss(value: float, text: str) -> None:
     assert number(value) == text
-
-
-def test_a_blending_switch_with_a_real_receiver_is_a_warning() -> None:
-    values = DEFAULTS | preset("second-gps") | {"GPS_AUTO_SWITCH": 2, "ARMING_CHECK": 1}
-    lines = lines_by_check(values, context(gps_id=1))
-    assert (lines["GPS_AUTO_SWITCH"].status, lines["ARMING_CHECK"].status) == ("warn", "warn")
-    assert "GPS_PRIMARY" in lines
-    assert "GPS_AUTO_SWITCH" not in lines_by_check(DEFAULTS, context())  # not relevant without another receiver
-
-
-def test_only_a_copter_has_a_failsafe_action() -> None:
-    values = DEFAULTS | preset("copter") | {"FS_EKF_ACTION": 0}
-    assert "drifts on" in lines_by_check(values, context(plane=False))["FS_EKF_ACTION"].text
-    assert "FS_EKF_ACTION" not in lines_by_check(values, context(plane=True))
-
-
-def test_fusing_all_velocities_is_a_warning_where_another_source_set_has_one() -> None:
-    assert "EK3_SRC_OPTIONS" not in lines_by_check(DEFAULTS | preset("plane"), context())
-    values = DEFAULTS | preset("plane") | {"EK3_SRC2_VELXY": 6}
-    assert lines_by_check(values, context())["EK3_SRC_OPTIONS"].fix == "set 0"
-
-
-@pytest.mark.parametrize(
-    ("values", "name"),
-    [({"GPS_AUTO_SWITCH": 0}, "GPS_AUTO_SWITCH"), ({"GPS_PRIMARY": 1}, "GPS_PRIMARY")],
-)
-def test_what_a_flight_on_terrafix_leaves_is_a_warning(values: dict[str, float], name: str) -> None:
-    line = lines_by_check(DEFAULTS | preset("second-gps") | values, context(gps_id=1))[name]
-    assert line.status == "warn"
-    assert line.change is not None and line.change.new == preset("second-gps")[name]
 
 
 def test_local_frame_outputs_have_their_own_rules() -> None:
@@ -300,14 +288,16 @@ def test_the_recommended_delay_follows_from_the_line(
 # --- the MAVLink client ---
 
 
-def connected(there: GroundAutopilot, **link: Any) -> Autopilot:
-    return Autopilot(LinkSection(**link), there)
+@contextmanager
+def connected(values: dict[str, float], **more: Any) -> Iterator[Autopilot]:
+    """``more``: of GroundAutopilot."""
+    with Autopilot(LinkSection(), GroundAutopilot(values, **more)) as autopilot:
+        autopilot.connect(1.0)
+        yield autopilot
 
 
 def test_parameters_are_read_despite_packet_loss() -> None:
-    there = GroundAutopilot(DEFAULTS, loses=20)
-    with connected(there) as autopilot:
-        autopilot.connect(1.0)
+    with connected(DEFAULTS, loses=20) as autopilot:
         read = autopilot.read([*DEFAULTS, "NO_SUCH_PARAMETER"])
     assert read == pytest.approx(DEFAULTS)
     assert (autopilot.plane, autopilot.sysid, autopilot.armed) == (True, 1, False)
@@ -323,7 +313,7 @@ def test_parameters_are_read_despite_packet_loss() -> None:
     ],
 )
 def test_a_wrong_or_ambiguous_autopilot_is_an_error(there: GroundAutopilot, link: dict[str, Any], says: str) -> None:
-    with connected(there, **link) as autopilot, pytest.raises(LinkError, match=says) as caught:
+    with Autopilot(LinkSection(**link), there) as autopilot, pytest.raises(LinkError, match=says) as caught:
         autopilot.connect(0.3)
     assert "\n" not in str(caught.value)
 
@@ -372,33 +362,42 @@ def test_the_streams_of_the_link_are_requested_and_counted(
 
 
 def test_unreadable_parameters_are_one_line() -> None:
-    with connected(GroundAutopilot({})) as autopilot:
-        autopilot.connect(0.3)
-        with pytest.raises(LinkError, match="does not answer requests for parameters"):
-            autopilot.read(["GPS1_TYPE"])
+    with connected({}) as autopilot, pytest.raises(LinkError, match="does not answer requests for parameters"):
+        autopilot.read(["GPS1_TYPE"])
 
 
 def test_a_parameter_that_keeps_its_value_is_an_error() -> None:
-    with connected(GroundAutopilot(DEFAULTS, read_only=("GPS1_TYPE",))) as autopilot:
-        autopilot.connect(0.3)
-        with pytest.raises(LinkError, match="GPS1_TYPE could not be set to 14"):
-            autopilot.write("GPS1_TYPE", 14)
+    with (
+        connected(DEFAULTS, read_only=("GPS1_TYPE",)) as autopilot,
+        pytest.raises(LinkError, match="GPS1_TYPE could not be set to 14"),
+    ):
+        autopilot.write("GPS1_TYPE", 14)
 
 
 # --- the command ---
 
 
+Wired = Callable[..., GroundAutopilot]
+
+
 @pytest.fixture
-def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[GroundAutopilot], None]:
-    def put(there: GroundAutopilot) -> None:
+def wired(monkeypatch: pytest.MonkeyPatch) -> Wired:
+    """``wired(values, **of_GroundAutopilot)``: the autopilot that the command finds."""
+
+    def put(values: dict[str, float], **more: Any) -> GroundAutopilot:
+        there = GroundAutopilot(values, **more)
         monkeypatch.setattr(conversation, "open_at_start", lambda _device, _baud: there)
+        return there
 
     return put
 
 
-def test_write_sets_wrong_parameters_and_saves_the_previous_values(wired: Any, tmp_path: Path, capsys: Any) -> None:
-    there = GroundAutopilot(DEFAULTS)
-    wired(there)
+def run(*arguments: str, answer: str | None = None) -> Result:
+    return CliRunner().invoke(app, ["preflight", *arguments], input=answer)
+
+
+def test_write_sets_wrong_parameters_and_saves_the_previous_values(wired: Wired, tmp_path: Path, capsys: Any) -> None:
+    there = wired(DEFAULTS)
     ready = preflight([], out=tmp_path, write=True, yes=True, as_json=True, with_computer=False)
     output = json.loads(capsys.readouterr().out)
     assert ready and output["ready"]
@@ -408,10 +407,9 @@ def test_write_sets_wrong_parameters_and_saves_the_previous_values(wired: Any, t
     assert set(saved) == {change["name"] for change in output["written"]} == set(there.parameters_set)
 
 
-def test_after_writing_the_result_is_that_of_the_values_read_back(wired: Any, tmp_path: Path) -> None:
-    there = GroundAutopilot(DEFAULTS)
-    wired(there)
-    done = CliRunner().invoke(app, ["preflight", "--write", "--yes", "--autopilot-only", "--out", str(tmp_path)])
+def test_after_writing_the_result_is_that_of_the_values_read_back(wired: Wired, tmp_path: Path) -> None:
+    wired(DEFAULTS)
+    done = run("--write", "--yes", "--autopilot-only", "--out", str(tmp_path))
     assert done.exit_code == 0
     assert "Read back from the autopilot:" in done.output
     assert "0 failures" in done.output.splitlines()[-1]
@@ -424,7 +422,7 @@ LEFT = {"GPS_AUTO_SWITCH": 4, "GPS_PRIMARY": 1}  # by a flight that ended on Ter
 def second(tmp_path: Path) -> list[str]:
     config = tmp_path / "second.toml"
     config.write_text("[link]\ngps_id = 1\n")
-    return ["preflight", "--autopilot-only", "--config", str(config), "--out", str(tmp_path / "out")]
+    return ["--autopilot-only", "--config", str(config), "--out", str(tmp_path / "out")]
 
 
 @pytest.fixture
@@ -434,44 +432,39 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_restore_sets_back_what_a_flight_has_changed_and_nothing_else(
-    wired: Any, second: list[str], state: Path
+    wired: Wired, second: list[str], state: Path
 ) -> None:
     PreviousSourceFile(state).save(PreviousSource(1, {"GPS_AUTO_SWITCH": 2.0, "GPS_PRIMARY": 0.0}))
-    there = GroundAutopilot(DEFAULTS | preset("second-gps") | LEFT | {"GPS2_DELAY_MS": 0})
-    wired(there)
-    seen = CliRunner().invoke(app, second)
+    there = wired(DEFAULTS | preset("second-gps") | LEFT | {"GPS2_DELAY_MS": 0})
+    seen = run(*second)
     assert seen.exit_code == 1
     assert "GPS_PRIMARY is 1 since a flight that ended on Terrafix; it was 0" in seen.output
     assert "terrafix preflight --restore" in seen.output
-    CliRunner().invoke(app, [*second, "--restore", "--yes"])
+    run(*second, "--restore", "--yes")
     assert {name: there.values[name] for name in LEFT} == {"GPS_AUTO_SWITCH": 2.0, "GPS_PRIMARY": 0.0}
     assert set(there.parameters_set) == set(LEFT)
     assert PreviousSourceFile(state).load() is None
 
 
-def test_restore_without_a_file_sets_what_the_rules_want(wired: Any, second: list[str], state: Path) -> None:
-    there = GroundAutopilot(DEFAULTS | preset("second-gps") | LEFT)
-    wired(there)
-    done = CliRunner().invoke(app, [*second, "--restore", "--yes"])
+def test_restore_without_a_file_sets_what_the_rules_want(wired: Wired, second: list[str], state: Path) -> None:
+    there = wired(DEFAULTS | preset("second-gps") | LEFT)
+    done = run(*second, "--restore", "--yes")
     assert done.exit_code == 0
     assert there.values["GPS_PRIMARY"] == 0
     assert there.parameters_set == ["GPS_PRIMARY"]
 
 
-def test_restore_leaves_the_state_of_another_vehicle(wired: Any, second: list[str], state: Path) -> None:
+def test_restore_leaves_the_state_of_another_vehicle(wired: Wired, second: list[str], state: Path) -> None:
     PreviousSourceFile(state).save(PreviousSource(9, {"GPS_PRIMARY": 0.0}))
-    there = GroundAutopilot(DEFAULTS | preset("second-gps") | LEFT)
-    wired(there)
-    done = CliRunner().invoke(app, [*second, "--restore", "--yes"])
+    wired(DEFAULTS | preset("second-gps") | LEFT)
+    done = run(*second, "--restore", "--yes")
     assert "since a flight" not in done.output
     assert PreviousSourceFile(state).load() is not None
 
 
-def test_without_confirmation_nothing_is_set(wired: Any, tmp_path: Path) -> None:
-    there = GroundAutopilot(DEFAULTS)
-    wired(there)
-    arguments = ["preflight", "--write", "--autopilot-only", "--out", str(tmp_path)]
-    done = CliRunner().invoke(app, arguments, input="n\n")
+def test_without_confirmation_nothing_is_set(wired: Wired, tmp_path: Path) -> None:
+    there = wired(DEFAULTS)
+    done = run("--write", "--autopilot-only", "--out", str(tmp_path), answer="n\n")
     assert done.exit_code == 1
     assert "GPS1_TYPE        1 -> 14" in done.output
     assert there.parameters_set == []
@@ -483,17 +476,15 @@ def test_json_with_write_requires_yes(tmp_path: Path) -> None:
         preflight([], out=tmp_path, write=True, as_json=True)
 
 
-def test_nothing_is_set_on_an_armed_vehicle(wired: Any, tmp_path: Path) -> None:
-    there = GroundAutopilot(DEFAULTS, armed=True)
-    wired(there)
+def test_nothing_is_set_on_an_armed_vehicle(wired: Wired, tmp_path: Path) -> None:
+    there = wired(DEFAULTS, armed=True)
     with pytest.raises(UsageError, match="disarm it"):
         preflight([], out=tmp_path, write=True, yes=True, with_computer=False)
     assert there.parameters_set == []
 
 
 def test_a_missing_autopilot_is_a_failure_and_the_other_checks_run(tmp_path: Path) -> None:
-    arguments = ["preflight", "--json", "--link", "udpout:127.0.0.1:9", "--out", str(tmp_path)]
-    done = CliRunner().invoke(app, arguments)
+    done = run("--json", "--link", "udpout:127.0.0.1:9", "--out", str(tmp_path))
     lines = {line["check"]: line for line in json.loads(done.output)["lines"]}
     assert done.exit_code == 1
     assert lines["autopilot"]["status"] == "fail"
@@ -503,9 +494,8 @@ def test_a_missing_autopilot_is_a_failure_and_the_other_checks_run(tmp_path: Pat
 
 def test_correlation_on_a_gpu_is_checked_where_it_is_configured(tmp_path: Path) -> None:
     def correlation_lines(models: Models) -> list[Line]:
-        return [
-            line for line in computer.check_lines(Config(models=models), None, tmp_path) if line.check == "correlation"
-        ]
+        lines = computer.check_lines(Config(models=models), None, tmp_path)
+        return [line for line in lines if line.check == "correlation"]
 
     (line,) = correlation_lines(Models(correlation="gpu", folder=str(tmp_path)))
     assert line.status is Status.FAIL and "no model is called 'correlation-512'" in line.text
@@ -515,49 +505,52 @@ def test_correlation_on_a_gpu_is_checked_where_it_is_configured(tmp_path: Path) 
 
 @pytest.mark.parametrize("device", ["udpin:127.0.0.1", "udpin:127.0.0.1:70000", "127.0.0.1:14550", "tcp:127.0.0.1:9"])
 def test_an_invalid_device_is_one_failure_with_a_fix(device: str, tmp_path: Path) -> None:
-    arguments = ["preflight", "--json", "--autopilot-only", "--link", device, "--out", str(tmp_path)]
-    (line,) = json.loads(CliRunner().invoke(app, arguments).output)["lines"]
+    done = run("--json", "--autopilot-only", "--link", device, "--out", str(tmp_path))
+    (line,) = json.loads(done.output)["lines"]
     assert device in line["text"]
     assert line["fix"] and line["fix"] not in line["text"]
 
 
-def test_an_old_firmware_is_a_failure(wired: Any, tmp_path: Path) -> None:
-    there = GroundAutopilot(DEFAULTS | preset("plane"), version=4 << 24 | 5 << 16)
-    with connected(there) as autopilot:
-        autopilot.connect(0.3)
+def test_an_old_firmware_is_a_failure() -> None:
+    with connected(DEFAULTS | preset("plane"), version=4 << 24 | 5 << 16) as autopilot:
         lines = {line.check: line for line in vehicle.check_lines(autopilot, LinkSection(), 5.0)}
     assert lines["firmware"].status == "fail"
     assert "4.5.0" in lines["firmware"].text
 
 
 def test_the_mission_on_board_is_saved_as_a_file(tmp_path: Path) -> None:
-    there = GroundAutopilot(DEFAULTS, mission=((22, 48.0, 11.0, 50.0), (16, 48.01, 11.02, 120.0)))
-    with connected(there) as autopilot:
-        autopilot.connect(0.3)
+    with connected(DEFAULTS, mission=((22, 48.0, 11.0, 50.0), (16, 48.01, 11.02, 120.0))) as autopilot:
         assert vehicle.save_mission(autopilot, tmp_path / "m") is None
     plan = read_mission(tmp_path / "m")
     assert plan.items[-1].lat_deg == pytest.approx(48.01)
     assert plan.items[-1].height_m == 120.0
 
 
-@pytest.mark.slow
-def test_a_mission_on_board_with_any_items_is_checked_against_the_map(tmp_path: Path, wired: Any) -> None:
+@pytest.fixture
+def small_map(tmp_path: Path) -> Path:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=1.0)
-    package = build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
-    opened = MapPackage.open(package)
-    west, south, east, north = opened.manifest.bounds_wgs84
-    opened.close()
-    lat, lon = (south + north) / 2, (west + east) / 2
+    return build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
+
+
+@pytest.mark.slow
+def test_a_mission_on_board_with_any_items_is_checked_against_the_map(
+    tmp_path: Path, small_map: Path, wired: Wired
+) -> None:
+    centre = centre_of(small_map)
+    lat, lon = centre.lat_deg, centre.lon_deg
     on_it = ((189, lat, lon, 60.0), (177, 0.0, 0.0, 0.0), (82, lat + 1e-4, lon, 60.0))  # DO_LAND_START, jump, spline
-    for items, status in ((on_it, "ok"), ((*on_it, (82, north + 0.01, lon, 60.0)), "fail")):
-        wired(GroundAutopilot(DEFAULTS, mission=items, home=(lat, lon)))
-        arguments = ["preflight", "--link", "udpout:127.0.0.1:9", "--map", str(package), "--json"]
-        done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
+    for items, status in ((on_it, "ok"), ((*on_it, (82, lat + 0.02, lon, 60.0)), "fail")):
+        wired(DEFAULTS, mission=items, home=(lat, lon))
+        done = run("--link", "udpout:127.0.0.1:9", "--map", str(small_map), "--json", "--out", str(tmp_path / "out"))
         lines = {line["check"]: line for line in json.loads(done.output)["lines"]}
         assert lines["mission"]["status"] == status, lines["mission"]
 
 
 # --- this computer ---
+
+
+def computer_lines(config: Config, mission: Path | None, out: Path) -> dict[str, Line]:
+    return {line.check: line for line in computer.check_lines(config, mission, out)}
 
 
 def noise(seed: int) -> np.ndarray:
@@ -581,19 +574,14 @@ def test_heat_low_disk_space_and_a_wrong_clock_are_warnings(tmp_path: Path, monk
     (zone / "type").write_text("cpu-thermal")
     config = Config(health=HealthSection(sysfs_root=str(tmp_path)), recorder=RecorderSection(budget_mb=10**9))
     monkeypatch.setattr(computer.time, "time_ns", lambda: 0)
-    lines = {line.check: line for line in computer.check_lines(config, None, tmp_path / "out")}
+    lines = computer_lines(config, None, tmp_path / "out")
     assert (lines["temperature"].status, lines["disk"].status, lines["clock"].status) == ("warn", "warn", "warn")
     assert "83 C (cpu-thermal), on the ground already" in lines["temperature"].text
     assert "GPS week" in lines["clock"].text
 
 
-def test_start_and_mission_must_lie_on_the_map(tmp_path: Path) -> None:
-    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300), pixel_m=1.0)
-    package = build(tif, tmp_path / "m.gpkg", date="2020-01-01", licence="CC0")
-    opened = MapPackage.open(package)
-    west, south, east, north = opened.manifest.bounds_wgs84
-    opened.close()
-    frame = LocalFrame((south + north) / 2, (west + east) / 2)
+def test_start_and_mission_must_lie_on_the_map(tmp_path: Path, small_map: Path) -> None:
+    frame, path = centre_of(small_map), str(small_map)
 
     def lines(start_m: tuple[float, float], *way_m: tuple[float, float], signed: bool = False) -> dict[str, Line]:
         places = [frame.to_wgs84(*place) for place in way_m]
@@ -601,19 +589,19 @@ def test_start_and_mission_must_lie_on_the_map(tmp_path: Path) -> None:
         mission = tmp_path / "m.waypoints"
         write_mission(mission, Mission("test", *places[0], items))
         lat, lon = frame.to_wgs84(*start_m)
-        chosen = MapSection(path=str(package), require_signature=signed, trusted_keys=[str(tmp_path / "a.pub")])
+        chosen = MapSection(path=path, require_signature=signed, trusted_keys=[str(tmp_path / "a.pub")])
         config = Config(map=chosen, source=SourceSection(start=f"{lat:.7f},{lon:.7f}"))
-        return {line.check: line for line in computer.check_lines(config, mission, tmp_path)}
+        return computer_lines(config, mission, tmp_path)
 
     good = lines((0.0, 0.0), (-50.0, 0.0), (50.0, 50.0))
     assert [good[check].status for check in ("map", "start", "mission")] == ["ok"] * 3
-    config = Config(map=MapSection(path=str(package)))
-    unknown = {line.check: line for line in computer.check_lines(config, tmp_path / "none.plan", tmp_path)}
+    config = Config(map=MapSection(path=path))
+    unknown = computer_lines(config, tmp_path / "none.plan", tmp_path)
     assert [unknown[check].status for check in ("map", "start", "mission")] == ["ok", "warn", "fail"]
     assert "no such mission file" in unknown["mission"].text
     assert "autopilot's GNSS" in unknown["start"].text and "whole map" in unknown["start"].text
-    config = Config(map=MapSection(path=str(package)), link=LinkSection(gnss_start=False))
-    searched = {line.check: line for line in computer.check_lines(config, tmp_path / "none.plan", tmp_path)}
+    config = Config(map=MapSection(path=path), link=LinkSection(gnss_start=False))
+    searched = computer_lines(config, tmp_path / "none.plan", tmp_path)
     assert "GNSS" not in searched["start"].text and "whole map" in searched["start"].text
     bad = lines((900.0, 0.0), (0.0, 0.0), (400.0, 0.0))
     assert (bad["start"].status, bad["mission"].status) == ("fail", "fail")
@@ -626,7 +614,7 @@ def test_start_and_mission_must_lie_on_the_map(tmp_path: Path) -> None:
 
 def test_a_missing_map_is_a_failure_with_a_fix(tmp_path: Path) -> None:
     config = Config(map=MapSection(path=str(tmp_path / "none.gpkg")))
-    lines = {line.check: line for line in computer.check_lines(config, None, tmp_path)}
+    lines = computer_lines(config, None, tmp_path)
     assert lines["map"].status == "fail"
     assert "terrafix map build" in lines["map"].fix
 

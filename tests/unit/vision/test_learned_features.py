@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tiny_onnx
 from terrafix.core.config import Config, Models, Vision
 from terrafix.core.errors import ModelError
 from terrafix.core.frames import MemoryFrameStore
@@ -55,6 +56,10 @@ def dots() -> np.ndarray:
     return image
 
 
+def frame_of(i: int) -> Frame:
+    return Frame(t_ns=i * 10**9, frame_id=i, file="", width=PINHOLE.width, height=PINHOLE.height)
+
+
 @pytest.mark.parametrize("turns", range(4))
 def test_an_image_is_matched_in_any_rotation(turns: int) -> None:
     matcher, image = LearnedMatcher(Upright(), MutualNearestMatcher()), dots()
@@ -80,8 +85,7 @@ def test_after_a_failure_of_the_model_odometry_continues_with_sift() -> None:
     published = []
     for i, north_m in enumerate((0.0, 60.0, 110.0, 160.0)):  # too far apart to be tracked
         store.put(i, view(ground, PINHOLE, rotation(), np.array([0.0, north_m - 80.0, 100.0])))
-        frame = Frame(t_ns=i * 10**9, frame_id=i, file="", width=PINHOLE.width, height=PINHOLE.height)
-        published += list(node.on(frame))
+        published += list(node.on(frame_of(i)))
     (event,) = (m for m in published if isinstance(m, ModelEvent))
     assert (event.t_ns, event.model, event.change) == (10**9, "upright, mutual nearest", ModelChange.GIVEN_UP)
     assert "out of memory; odometry continues with SIFT" in event.detail
@@ -107,30 +111,9 @@ def test_a_model_that_is_not_there_ends_the_start_and_is_replaced_by_sift_in_fli
 
 
 def test_only_models_with_keypoints_can_be_used(tmp_path: Path) -> None:
-    vector = """name = "places"
-title = "a place descriptor"
-role = "global"
-licence = "CC0"
-file = "places.onnx"
-sha256 = "0000000000000000000000000000000000000000000000000000000000000000"
-size_bytes = 1
-[image]
-input = "image"
-colour = "rgb"
-[vector]
-output = "embedding"
-size = 4
-side_px = 64
-[[inputs]]
-name = "image"
-shape = [1, 3, 64, 64]
-[[outputs]]
-name = "embedding"
-shape = [1, 4]
-"""
-    (tmp_path / "places.toml").write_text(vector, encoding="utf-8")
-    with pytest.raises(ModelFileError, match="the model 'places' has no keypoints: its role is global"):
-        open_point_features("places", str(tmp_path))
+    tiny_onnx.write(tmp_path, tiny_onnx.GLOBAL, b"no model")
+    with pytest.raises(ModelFileError, match="the model 'means' has no keypoints: its role is global"):
+        open_point_features("means", str(tmp_path))
     with pytest.raises(ModelFileError, match="no model is called 'sfit'"):
         open_point_features("sfit", str(tmp_path))
 
@@ -149,8 +132,7 @@ def test_photos_are_registered_with_a_model_that_the_configuration_names(
     published = []
     for i, (north_m, yaw_deg) in enumerate(((-30.0, 0.0), (15.0, 176.0))):
         node._frames.put(i, view(ground, PINHOLE, rotation(yaw_deg), np.array([0.0, north_m, 100.0])))
-        frame = Frame(t_ns=i * 10**9, frame_id=i, file="", width=PINHOLE.width, height=PINHOLE.height)
-        published += [m for m in node.on(frame) if isinstance(m, Odometry)]
+        published += [m for m in node.on(frame_of(i)) if isinstance(m, Odometry)]
     assert published[1].verdict is Verdict.ACCEPTED and published[1].keyframe_id == 0
     pairs = np.array(published[1].two_view)
     turned = -(pairs[:, 2:] @ np.array([[np.cos(0.07), -np.sin(0.07)], [np.sin(0.07), np.cos(0.07)]]))

@@ -3,20 +3,22 @@
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
 from source_folders import flight, picture
 from terrafix.core.clock import now_ns
-from terrafix.core.config import Config, HealthSection, Source
+from terrafix.core.config import Config, HealthSection
+from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import OVERTAKEN, Frame, Health, Message, Origin, SourceEnded, ThermalBand, VehicleState
 from terrafix.vision.edge import SourceEdge, make_edge
 from terrafix.vision.frame_rate import FrameRateLimit
-from terrafix.vision.sources import Shot, open_source
+from terrafix.vision.sources import Shot, Source, open_source
 
 pytestmark = pytest.mark.real_time
 
@@ -47,22 +49,27 @@ class Listener:
         return any(isinstance(m, SourceEnded) for m in self.messages)
 
 
+Listen = Callable[..., Listener]
+
+
 @pytest.fixture
-def closing() -> Iterator[list[SourceEdge]]:
-    edges: list[SourceEdge] = []
-    yield edges
-    for edge in edges:
-        edge.close()
+def listen() -> Iterator[Listen]:
+    """``listen(flight folder or source, epoch_ns, realtime, **of_SourceEdge)``: to an edge that the test closes."""
+    listeners: list[Listener] = []
+
+    def start(source: Path | Source, epoch_ns: int | None = None, realtime: bool = True, **more: Any) -> Listener:
+        opened = open_source(str(source)) if isinstance(source, Path) else source
+        store = more.pop("store", MemoryFrameStore())
+        listeners.append(Listener(SourceEdge(opened, store, epoch_ns, realtime, **more)))
+        return listeners[-1]
+
+    yield start
+    for listener in listeners:
+        listener.edge.close()
 
 
-def edge_of(closing: list[SourceEdge], folder: Path, epoch_ns: int | None = None, realtime: bool = True) -> Listener:
-    edge = SourceEdge(open_source(str(folder)), MemoryFrameStore(), epoch_ns, realtime)
-    closing.append(edge)
-    return Listener(edge)
-
-
-def test_a_recording_plays_in_real_time(tmp_path: Path, closing: list[SourceEdge]) -> None:
-    listener = edge_of(closing, flight(tmp_path / "f", 4, step_s=0.1))
+def test_a_recording_plays_in_real_time(tmp_path: Path, listen: Listen) -> None:
+    listener = listen(flight(tmp_path / "f", 4, step_s=0.1))
     listener.until(listener.ended)
     assert isinstance(listener.messages[0], Origin)
     zero_ns = listener.messages[0].t_ns
@@ -75,9 +82,9 @@ def test_a_recording_plays_in_real_time(tmp_path: Path, closing: list[SourceEdge
     assert list(listener.edge.poll(now_ns())) == []  # the end is published once
 
 
-def test_a_restart_resumes_at_the_current_flight_time(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_a_restart_resumes_at_the_current_flight_time(tmp_path: Path, listen: Listen) -> None:
     epoch_ns = now_ns() - 550_000_000
-    listener = edge_of(closing, flight(tmp_path / "f", 12, step_s=0.1), epoch_ns)
+    listener = listen(flight(tmp_path / "f", 12, step_s=0.1), epoch_ns)
     listener.until(listener.ended)
     assert listener.messages[0].t_ns == epoch_ns
     ids = [f.frame_id for f in listener.frames]
@@ -85,23 +92,23 @@ def test_a_restart_resumes_at_the_current_flight_time(tmp_path: Path, closing: l
     assert [f.t_ns - epoch_ns for f in listener.frames] == [i * 100_000_000 for i in ids]
 
 
-def test_a_restart_after_the_end_publishes_the_end(tmp_path: Path, closing: list[SourceEdge]) -> None:
-    listener = edge_of(closing, flight(tmp_path / "f", 3, step_s=0.1), now_ns() - 10**10)
+def test_a_restart_after_the_end_publishes_the_end(tmp_path: Path, listen: Listen) -> None:
+    listener = listen(flight(tmp_path / "f", 3, step_s=0.1), now_ns() - 10**10)
     listener.until(listener.ended)
     assert listener.frames == [] and listener.messages[-1].frames == 3  # type: ignore[attr-defined]
 
 
-def test_playback_without_real_time_drops_no_frame(tmp_path: Path, closing: list[SourceEdge]) -> None:
-    listener = edge_of(closing, flight(tmp_path / "f", 12, step_s=60.0), realtime=False)
+def test_playback_without_real_time_drops_no_frame(tmp_path: Path, listen: Listen) -> None:
+    listener = listen(flight(tmp_path / "f", 12, step_s=60.0), realtime=False)
     listener.until(listener.ended)
     assert [f.frame_id for f in listener.frames] == list(range(12))
     assert not any(f.error for f in listener.frames)
 
 
 def test_the_newest_frame_is_delivered_and_dropped_frames_are_published_with_an_error(
-    tmp_path: Path, closing: list[SourceEdge]
+    tmp_path: Path, listen: Listen
 ) -> None:
-    listener = edge_of(closing, flight(tmp_path / "f", 10, step_s=0.02))
+    listener = listen(flight(tmp_path / "f", 10, step_s=0.02))
     listener.until(lambda: len(listener.frames) >= 1)
     time.sleep(0.7)  # vision is busy with the first frame
     listener.until(listener.ended)
@@ -136,19 +143,16 @@ class BrokenSource:
             yield Shot(frame, (), picture(i))
 
 
-def test_an_exception_in_the_reader_thread_ends_the_process(tmp_path: Path, closing: list[SourceEdge]) -> None:
-    edge = SourceEdge(BrokenSource(str(flight(tmp_path / "f")), live=False, bug=True), MemoryFrameStore(), None, True)
-    closing.append(edge)
+def test_an_exception_in_the_reader_thread_ends_the_process(tmp_path: Path, listen: Listen) -> None:
+    listener = listen(BrokenSource(str(flight(tmp_path / "f")), live=False, bug=True))
     with pytest.raises(ZeroDivisionError):
-        Listener(edge).until(lambda: False)
+        listener.until(lambda: False)
 
 
-def test_frame_ids_of_a_camera_increase_over_a_restart(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_frame_ids_of_a_camera_increase_over_a_restart(tmp_path: Path, listen: Listen) -> None:
     camera = BrokenSource(str(flight(tmp_path / "f")), live=True, bug=False)
     store = MemoryFrameStore()
-    edge = SourceEdge(camera, store, now_ns() - 5 * 10**9, True)
-    closing.append(edge)
-    listener = Listener(edge)
+    listener = listen(camera, now_ns() - 5 * 10**9, store=store)
     listener.until(listener.ended)
     first, second = (f.frame_id for f in listener.frames)
     assert first >= 5000 and second == first + 1
@@ -156,15 +160,16 @@ def test_frame_ids_of_a_camera_increase_over_a_restart(tmp_path: Path, closing: 
     assert abs(now_ns() - listener.frames[0].t_ns) < 5 * 10**9  # camera times are already on the monotonic clock
 
 
-def test_make_edge_reads_the_configuration(tmp_path: Path, closing: list[SourceEdge]) -> None:
+def test_make_edge_reads_the_configuration(tmp_path: Path) -> None:
     def context(**source: str) -> NodeContext:
-        config = Config(source=Source(**source))  # type: ignore[arg-type]
+        config = Config(source=SourceSection(**source))  # type: ignore[arg-type]
         return NodeContext(config=config, frames=MemoryFrameStore(), map_path=None, out_dir=tmp_path)
 
     folder = str(flight(tmp_path / "f"))
     edge = make_edge(context(path=folder, start="10,20"))
-    closing.append(edge)  # type: ignore[arg-type]
+    assert edge is not None
     (origin,) = edge.poll(now_ns())
+    edge.close()
     assert isinstance(origin, Origin) and (origin.lat_deg, origin.lon_deg) == (10.0, 20.0)
     with pytest.raises(UsageError):
         make_edge(context(path=folder, start="here"))
@@ -174,30 +179,24 @@ def test_make_edge_reads_the_configuration(tmp_path: Path, closing: list[SourceE
 
 @pytest.mark.parametrize(("own", "expected_m"), [(None, 612.0), (40.0, 40.0)])
 def test_the_ground_height_of_the_map_is_the_default_for_a_source_without_one(
-    tmp_path: Path, closing: list[SourceEdge], own: float | None, expected_m: float
+    tmp_path: Path, listen: Listen, own: float | None, expected_m: float
 ) -> None:
     source = open_source(str(flight(tmp_path / "f")))
     known = msgspec.structs.replace(source.origin(), ground_amsl_m=own)
     source.origin = lambda: known  # type: ignore[method-assign]
-    edge = SourceEdge(source, MemoryFrameStore(), None, False, 612.0)
-    closing.append(edge)
-    listener = Listener(edge)
+    listener = listen(source, None, False, ground_amsl_m=612.0)
     listener.until(listener.ended)
     assert isinstance(listener.messages[0], Origin) and listener.messages[0].ground_amsl_m == expected_m
 
 
 def test_in_a_hot_computer_frames_above_the_rate_are_left_out_and_their_telemetry_is_not(
-    tmp_path: Path, closing: list[SourceEdge]
+    tmp_path: Path, listen: Listen
 ) -> None:
     limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
-    edge = SourceEdge(
-        open_source(str(flight(tmp_path / "f", 20, step_s=0.05))), MemoryFrameStore(), None, True, rate=limit
-    )
-    closing.append(edge)
-    edge.on_message(
+    listener = listen(flight(tmp_path / "f", 20, step_s=0.05), rate=limit)
+    listener.edge.on_message(
         Health(t_ns=0, band=ThermalBand.HOT, temperature_c=85.0, throttled=False, disk_free_mb=None, cause="test")
     )
-    listener = Listener(edge)
     listener.until(listener.ended)
     assert [f.frame_id for f in listener.frames] == [0, 4, 8, 12, 16]
     assert not any(f.error for f in listener.frames)
@@ -206,14 +205,10 @@ def test_in_a_hot_computer_frames_above_the_rate_are_left_out_and_their_telemetr
 
 
 def test_a_recording_that_is_not_played_in_real_time_is_read_whole_in_a_hot_computer(
-    tmp_path: Path, closing: list[SourceEdge]
+    tmp_path: Path, listen: Listen
 ) -> None:
     limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
     limit.band = ThermalBand.HOT
-    edge = SourceEdge(
-        open_source(str(flight(tmp_path / "f", 12, step_s=0.05))), MemoryFrameStore(), None, False, rate=limit
-    )
-    closing.append(edge)
-    listener = Listener(edge)
+    listener = listen(flight(tmp_path / "f", 12, step_s=0.05), realtime=False, rate=limit)
     listener.until(listener.ended)
     assert len(listener.frames) == 12

@@ -3,13 +3,13 @@
 import msgspec
 import numpy as np
 
+from origins import origin_of
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import Camera, Frame, KeyframeLink, Odometry, Origin, Verdict
 from terrafix.vision.feature_tracker import FrameTracker, Link, Motion
 from terrafix.vision.node import VisionNode
 from terrafix.vision.relocalization import RelocalizationSearch
-from vision_origin import origin_of
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 ORIGIN = origin_of(CAMERA)

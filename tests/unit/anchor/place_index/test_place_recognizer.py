@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import map_rasters
+from map_packages import centre_of
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.matching.map_layers import MapLayers
 from terrafix.anchor.place_index.index import PlaceIndex
@@ -15,7 +16,7 @@ from terrafix.anchor.relocalization import block_search, map_search
 from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, select_blocks
 from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.geodesy import LocalFrame, local_rotation_up
+from terrafix.core.geodesy import local_rotation_up
 from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
@@ -45,11 +46,6 @@ def memory(package: Path, tmp_path_factory: pytest.TempPathFactory) -> PlaceMemo
     out = tmp_path_factory.mktemp("index") / "i"
     write_index([package], out, IndexOptions(AGL_M, "pooled-gradient"))
     return PlaceMemory(PlaceIndex.open(out), PooledGradientPlaces())
-
-
-def centre_of(path: Path) -> LocalFrame:
-    west, south, east, north = MapPackage.open(path).manifest.bounds_wgs84
-    return LocalFrame((south + north) / 2, (west + east) / 2)
 
 
 @pytest.fixture(scope="module")

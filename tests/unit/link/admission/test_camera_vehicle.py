@@ -4,15 +4,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gps_messages import GPS
-from link_port import Port, Speaker, armed, listening
+from link_port import Port, Speaker, listening
 from link_rig import MS, S, estimate, gps, texts
-from link_wire import MemoryWire, attitude, heartbeat, packed, states
+from link_wire import WiredEdge, armed, attitude, heartbeat, states
 from terrafix import messages as m
-from terrafix.core.config import LinkSection
 from terrafix.link.admission.served_autopilot import (
     HEARTBEATS_ONLY_NS,
     LISTEN_NS,
@@ -21,41 +21,27 @@ from terrafix.link.admission.served_autopilot import (
     camera_texts,
     unclear_text,
 )
-from terrafix.link.autopilot.checkpoint import CheckpointWriter, load_checkpoint
-from terrafix.link.edge import MavlinkEdge
+from terrafix.link.autopilot.checkpoint import load_checkpoint
 from terrafix.link.node import LinkNode
 
 CAMERA_ON_9 = m.CameraVehicle(t_ns=0, sysid=9)
 CAMERA_ON_7 = m.CameraVehicle(t_ns=0, sysid=7)
 
 
-class Router:
-    """A wire with several vehicles behind it. ``published``: by the edge."""
-
-    def __init__(self, edge: MavlinkEdge | None = None, wire: MemoryWire | None = None, **config: Any) -> None:
-        self.wire = wire or MemoryWire()
-        self.edge = edge or MavlinkEdge(LinkSection(**config), self.wire, lambda: 0)
-        self.published: list[m.Message] = []
-        self._packers: dict[int, mavlink.MAVLink] = {}
-
-    def receives(self, now_ns: int, sysid: int, *messages: Any) -> list[m.Message]:
-        mav = self._packers.setdefault(sysid, mavlink.MAVLink(None, srcSystem=sysid, srcComponent=1))
-        self.wire.arrive(*(packed(message, mav) for message in messages))
-        published = list(self.edge.poll(now_ns))
-        self.published += published
-        return published
+class Router(WiredEdge):
+    """A wire with several vehicles behind it."""
 
     def sends(self, now_ns: int) -> int:
         """-> number of positions that leave for one GpsInput."""
         self.wire.take()
-        self.edge.on_message(m.GpsInput(**{f: getattr(GPS, f) for f in GPS.__struct_fields__} | {"t_ns": now_ns}))
+        self.edge.on_message(msgspec.structs.replace(GPS, t_ns=now_ns))
         return len(self.wire.take("GPS_INPUT"))
 
     def both(self, now_ns: int) -> list[m.Message]:
         """Heartbeats and attitudes of 7 and 9."""
         return [
-            *self.receives(now_ns, 7, armed(), attitude(now_ns // MS, yaw=1.0)),
-            *self.receives(now_ns + MS, 9, armed(), attitude(now_ns // MS, yaw=2.0)),
+            *self.receives(now_ns, armed(), attitude(now_ns // MS, yaw=1.0)),
+            *self.receives(now_ns + MS, armed(), attitude(now_ns // MS, yaw=2.0), sysid=9),
         ]
 
 
@@ -88,11 +74,8 @@ def test_the_vehicle_that_turns_as_the_camera_does_is_served(router: Router) -> 
 def test_the_pilot_is_told_that_it_is_unclear_and_how_to_state_it(router: Router) -> None:
     for second in range(1, 35):
         router.both(second * S)
-    assert texts(router.published) == ["Terrafix: no fix: camera on vehicle 7, 9?"] * 2  # every 30 s
-    assert (
-        "vehicle 7, 9: no position is sent until"
-        in [x for x in router.published if isinstance(x, m.LinkStatus)][-1].detail
-    )
+    assert router.texts() == ["Terrafix: no fix: camera on vehicle 7, 9?"] * 2  # every 30 s
+    assert "vehicle 7, 9: no position is sent until" in router.status().detail
     router.edge.on_message(CAMERA_ON_9)
     assert texts(router.both(36 * S)) == [
         "Terrafix: vehicle 9 is served, 7 is not",
@@ -131,55 +114,54 @@ def test_a_configured_system_id_is_served_beside_others() -> None:
 
 def test_a_vehicle_that_was_confirmed_alone_stays_served_whatever_comes_later(router: Router) -> None:
     for second in range(1, 100):
-        router.receives(second * S, 7, armed(), attitude(1000 * second))
+        router.receives(second * S, armed(), attitude(1000 * second))
     router.edge.on_message(CAMERA_ON_7)
     for second in range(100, 120):
         router.both(second * S)
         assert router.sends(second * S + 2 * MS) == 1
-    assert texts(router.published) == ["Terrafix: vehicle 9 on our link gets GPS_INPUT"]
+    assert router.texts() == ["Terrafix: vehicle 9 on our link gets GPS_INPUT"]
 
 
 def test_heartbeats_of_many_forged_system_ids_do_not_silence_a_confirmed_vehicle(router: Router) -> None:
-    router.receives(1 * S, 7, armed(), attitude(1000))
+    router.receives(1 * S, armed(), attitude(1000))
     router.edge.on_message(CAMERA_ON_7)
     for sysid in range(100, 200):
-        router.receives(2 * S + sysid * MS, sysid, armed(), attitude(1000))
+        router.receives(2 * S + sysid * MS, armed(), attitude(1000), sysid=sysid)
         assert router.sends(2 * S + sysid * MS) == 1
 
 
 def test_a_vehicle_that_was_not_confirmed_is_not_served_beside_a_second_one(router: Router) -> None:
-    router.receives(1 * S, 7, armed(), attitude(1000))
+    router.receives(1 * S, armed(), attitude(1000))
     assert router.sends(1 * S) == 1
     router.both(100 * S)
     assert router.sends(100 * S + 2 * MS) == 0
 
 
-@pytest.mark.parametrize("flies", [False, True])
-def test_a_vehicle_that_disappears_may_still_carry_the_camera_if_it_was_armed(router: Router, flies: bool) -> None:
-    router.receives(1 * S, 7, armed(), attitude(1000))
-    router.receives(1 * S, 9, armed() if flies else heartbeat(), attitude(1000))
-    sent = []
-    for at_ns in (S + VEHICLE_CHANGE_TIMEOUT_NS, S + VEHICLE_CHANGE_TIMEOUT_NS + MS):
-        router.receives(at_ns, 7, armed(), attitude(at_ns // MS))
-        sent.append(router.sends(at_ns))
-    assert sent == [0, 0 if flies else 1]
-
-
-def test_a_single_forged_heartbeat_silences_for_five_seconds_only(router: Router) -> None:
-    router.receives(1 * S, 7, armed(), attitude(1000))
-    router.receives(2 * S, 9, armed())
-    sent = []
-    for at_ns in (2 * S + HEARTBEATS_ONLY_NS, 2 * S + HEARTBEATS_ONLY_NS + MS):
-        router.receives(at_ns, 7, armed(), attitude(at_ns // MS))
-        sent.append(router.sends(at_ns))
-    assert sent == [0, 1]
+@pytest.mark.parametrize(
+    ("last", "silent_ns", "sent"),
+    [
+        pytest.param([heartbeat(), attitude(1000)], VEHICLE_CHANGE_TIMEOUT_NS, [0, 1], id="one that was not armed"),
+        pytest.param([armed(), attitude(1000)], VEHICLE_CHANGE_TIMEOUT_NS, [0, 0], id="one that was armed, for ever"),
+        pytest.param([armed()], HEARTBEATS_ONLY_NS, [0, 1], id="a single forged heartbeat, for five seconds only"),
+    ],
+)
+def test_a_vehicle_that_disappears_may_still_carry_the_camera_for_a_time(
+    router: Router, last: list[Any], silent_ns: int, sent: list[int]
+) -> None:
+    router.receives(1 * S, armed(), attitude(1000))
+    router.receives(1 * S, *last, sysid=9)
+    found = []
+    for at_ns in (S + silent_ns, S + silent_ns + MS):
+        router.receives(at_ns, armed(), attitude(at_ns // MS))
+        found.append(router.sends(at_ns))
+    assert found == sent
 
 
 def test_a_vehicle_that_follows_a_confirmed_one_must_be_confirmed_itself(router: Router) -> None:
-    router.receives(1 * S, 7, heartbeat(), attitude(1000))
+    router.receives(1 * S, heartbeat(), attitude(1000))
     router.edge.on_message(CAMERA_ON_7)
     later_ns = 2 * S + VEHICLE_CHANGE_TIMEOUT_NS
-    published = router.receives(later_ns, 9, heartbeat(), attitude(1000))
+    published = router.receives(later_ns, heartbeat(), attitude(1000), sysid=9)
     assert router.sends(later_ns) == 0 and served(published)[-1] == (9, False, [9])
     router.edge.on_message(CAMERA_ON_9)
     assert router.sends(later_ns + MS) == 1
@@ -187,50 +169,44 @@ def test_a_vehicle_that_follows_a_confirmed_one_must_be_confirmed_itself(router:
 
 def test_more_vehicles_than_are_compared_leave_it_unclear(router: Router) -> None:
     for sysid in range(1, MAX_RIVALS + 5):
-        router.receives(sysid * MS, sysid, armed())
+        router.receives(sysid * MS, armed(), sysid=sysid)
     assert len(served(router.published)[-1][2]) == MAX_RIVALS + 1
     assert router.sends(S) == 0
 
 
 def test_while_the_confirmed_vehicle_is_not_there_no_other_is_served(router: Router) -> None:
-    router.receives(1 * S, 7, armed(), attitude(1000))
+    router.receives(1 * S, armed(), attitude(1000))
     router.edge.on_message(CAMERA_ON_9)
     assert router.sends(1 * S) == 0
     router.both(2 * S)
     router.edge.on_message(CAMERA_ON_9)  # the estimator repeats it while the link does not serve that vehicle
-    assert router.sends(2 * S + MS) == 1 and served(router.receives(3 * S, 9))[-1] == (9, True, [])
+    assert router.sends(2 * S + MS) == 1 and served(router.receives(3 * S, sysid=9))[-1] == (9, True, [])
 
 
 # --- restart in flight ---
 
 
-def restarted(file: Path) -> Router:
-    wire = MemoryWire()
-    edge = MavlinkEdge(LinkSection(), wire, lambda: 0, checkpoint_writer=CheckpointWriter(file))
-    return Router(edge, wire)
-
-
 def test_a_link_that_restarts_while_it_is_unclear_sends_nothing_before_it_has_heard_the_others(tmp_path: Path) -> None:
     file = tmp_path / "link.checkpoint"
-    before = restarted(file)
+    before = Router(checkpoint=file)
     before.both(1 * S)
     before.both(2 * S)
     before.sends(2 * S + 2 * MS)
     found = load_checkpoint(file)
     assert found is not None and found.last is None
-    after = restarted(file)
+    after = Router(checkpoint=file)
     assert after.sends(10 * S) == 0
-    after.receives(10 * S, 7, armed(), attitude(1000))
+    after.receives(10 * S, armed(), attitude(1000))
     assert after.sends(10 * S) == 0
-    after.receives(10 * S + LISTEN_NS - MS, 9, armed(), attitude(1000))
+    after.receives(10 * S + LISTEN_NS - MS, armed(), attitude(1000), sysid=9)
     assert after.sends(11 * S + LISTEN_NS) == 0
 
 
 def test_a_restarted_link_that_hears_no_other_vehicle_sends_after_a_heartbeat(tmp_path: Path) -> None:
     file = tmp_path / "link.checkpoint"
-    restarted(file).receives(1 * S, 7, armed())
-    after = restarted(file)
-    after.receives(10 * S, 7, armed())
+    Router(checkpoint=file).receives(1 * S, armed())
+    after = Router(checkpoint=file)
+    after.receives(10 * S, armed())
     assert [after.sends(10 * S + LISTEN_NS - MS), after.sends(10 * S + LISTEN_NS)] == [0, 1]
 
 
@@ -259,7 +235,7 @@ def test_the_confirmed_vehicle_at_its_own_address_gets_the_position_and_the_othe
         port.receives(5 * S + MS, standing, armed(), attitude(5000))
         port.edge.on_message(GPS)
         assert len(flying.received("GPS_INPUT")) == 1 and standing.kinds() == set()
-        assert "second sender" not in port.detail()
+        assert "second sender" not in port.status().detail
 
 
 # --- the node ---

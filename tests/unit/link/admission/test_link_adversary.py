@@ -1,52 +1,22 @@
 """Forgers beside the real link (node and edge) and the simulated autopilot, in real time and on real sockets."""
 
-import math
-from collections.abc import Callable
-
-import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_port import Speaker, free_port, station_heartbeat
-from link_rig import ALT, LAT, LON, MS, SPEED_EAST, covariance, estimate, live, texts
+from link_port import Speaker, free_port
+from link_rig import MS, live, texts
+from link_wire import station_heartbeat
+from live_flight import LiveFlight, eastward
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import open_edge
-from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.node import LinkNode
-from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 
 pytestmark = pytest.mark.real_time
 
 SECONDS = 4.0
 FORGED_ROLL = 0.4  # rad: 23 degrees, which displaces the optical axis on the ground by half the height
-
-
-def eastward(north_m: float) -> Callable[[float], PeerState]:
-    """A course at SPEED_EAST, ``north_m`` north of that of the estimates."""
-
-    def course(t_s: float) -> PeerState:
-        lat, lon = offset(LAT, LON, SPEED_EAST * t_s, north_m)
-        return PeerState(lat, lon, ALT, 120.0, math.pi / 2, 0.02, 0.0, 0.0, SPEED_EAST, 0.0)
-
-    return course
-
-
-class Estimates:
-    """Four a second, of a vehicle on ``eastward(0)``."""
-
-    def __init__(self) -> None:
-        self._zero_ns: int | None = None
-        self._next_ns = 0
-
-    def __call__(self, now_ns: int) -> list[m.Message]:
-        self._zero_ns = now_ns if self._zero_ns is None else self._zero_ns
-        if now_ns < self._next_ns:
-            return []
-        self._next_ns = now_ns + 250 * MS
-        published = estimate(now_ns - self._zero_ns, cov=covariance(3.0))
-        return [msgspec.structs.replace(published, t_ns=now_ns, emitted_at_ns=now_ns)]
 
 
 class Forger:
@@ -62,50 +32,28 @@ class Forger:
         self._next_ns = now_ns + 40 * MS
         leaning = mavlink.MAVLink_attitude_message(now_ns // MS % 2**32, FORGED_ROLL, 0.0, 0.0, 0, 0, 0)
         hint = mavlink.MAVLink_set_gps_global_origin_message(self._sysid, 490_000_000, 120_000_000, 0)
-        self._speaker.send(self._to, leaning, station_heartbeat(), hint)
-
-
-@pytest.mark.slow
-def test_of_two_copters_on_one_port_only_the_served_one_receives_gps_input() -> None:
-    port = free_port()
-    edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
-    ours, theirs = AutopilotPeer(seed=1, sysid=1), AutopilotPeer(seed=2, sysid=2)
-    estimates = Estimates()
-    ours.start(0, eastward(0.0), to=port)
-    published = live(LinkNode(10.0), edge, 1.5, estimates)
-    edge.on_message(m.CameraVehicle(t_ns=0, sysid=1))
-    theirs.start(0, eastward(66_000.0), to=port)
-    published += live(LinkNode(10.0), edge, SECONDS, estimates)
-    first, second = ours.stop(), theirs.stop()
-    edge.close()
-    assert first.gps_input_received > 10 * (SECONDS - 1.0)
-    assert second.gps_input_received == 0
-    assert second.position_error_max_m is None or second.position_error_max_m < 100.0
-    assert [x.text for x in published if isinstance(x, m.StatusText) if "vehicle 2" in x.text] == [
-        "Terrafix: vehicle 2 on our port gets nothing"
-    ]
-    assert "Terrafix: vehicle 2 on our port gets nothing" in first.status_texts
+        self._speaker.send(leaning, station_heartbeat(), hint, to=self._to)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
 def test_forged_telemetry_and_hints_have_no_effect(kind: str) -> None:
-    peer, estimates = AutopilotPeer(seed=3), Estimates()
+    peer, flight = AutopilotPeer(seed=3), LiveFlight()
     if kind == "udpin":
         port = free_port()
-        peer.start(0, eastward(0.0), to=port)
+        peer.start(0, eastward, flight.clock, to=port)
     else:
-        port = peer.start(0, eastward(0.0))
+        port = peer.start(0, eastward, flight.clock)
     edge = open_edge(LinkSection(device=f"{kind}:127.0.0.1:{port}"))
     node, published = LinkNode(10.0), list[m.Message]()
-    published += live(node, edge, 1.5, estimates)
+    published += live(node, edge, 1.5, flight.feed)
     own = edge._connection._transport._socket.getsockname()  # type: ignore[union-attr]
     with Speaker(1) as speaker:
         forger = Forger(speaker, ("127.0.0.1", own[1]), 1)
 
         def feed(now_ns: int) -> list[m.Message]:
             forger.send_due(now_ns)
-            return estimates(now_ns)
+            return flight.feed(now_ns)
 
         published += live(node, edge, SECONDS, feed)
         assert speaker.received() == []

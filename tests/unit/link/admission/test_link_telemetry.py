@@ -9,9 +9,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from link_rig import MS, S
-from link_wire import MemoryWire, heartbeat, packed, states
+from link_wire import WiredEdge, heartbeat, packed, states
 from terrafix import messages as m
-from terrafix.core.config import LinkSection
 from terrafix.link.admission.boot_clock import CONFIRM_NS, MAX_BACKWARD_STEP_MS, WRAP_MS, BootClock, boot_step_ms
 from terrafix.link.admission.sequence_numbers import (
     MAX_LATE,
@@ -21,7 +20,6 @@ from terrafix.link.admission.sequence_numbers import (
     SequenceCheck,
 )
 from terrafix.link.admission.turn_check import JUMP_RAD, TurnCheck, attitude_sample
-from terrafix.link.edge import MavlinkEdge
 
 # --- sequence numbers ---
 
@@ -229,16 +227,13 @@ def test_attitudes_too_far_apart_to_compare_are_accepted() -> None:
 # --- all checks on one connection ---
 
 
-class Wire:
+class Wire(WiredEdge):
     """The edge with an autopilot, and a forger with the same system id behind the same router."""
 
     def __init__(self) -> None:
-        self._memory = MemoryWire()
-        self.edge = MavlinkEdge(LinkSection(), self._memory, lambda: 0)
-        self.true = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
-        self.forger = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+        super().__init__()
+        self.true, self.forger = (mavlink.MAVLink(None, 7, 1) for _ in range(2))
         self.forger.seq = 128
-        self.published: list[m.Message] = []
 
     def run(self, seconds: float, forged: Any = None) -> None:
         """``forged``: milliseconds since boot -> message of the forger."""
@@ -247,19 +242,16 @@ class Wire:
             boot_ms = now_ns // MS
             beat = [heartbeat()] if i % 50 == 0 else []
             true = [*beat, raw(boot_ms + self.imu_ahead_ms), attitude(boot_ms, 0.0)]
-            self._memory.arrive(*(packed(x, self.true) for x in true))
+            self.wire.arrive(*(packed(x, self.true) for x in true))
             if forged is not None:
-                self._memory.arrive(packed(forged(boot_ms), self.forger))
-            self.published += self.edge.poll(now_ns)
+                self.wire.arrive(packed(forged(boot_ms), self.forger))
+            self.poll(now_ns)
             self._steps += 1
 
     _steps, imu_ahead_ms = 0, 0
 
     def verdicts(self) -> list[m.MeasurementVerdict]:
         return [x for x in self.published if isinstance(x, m.MeasurementVerdict)]
-
-    def texts(self) -> list[str]:
-        return [x.text for x in self.published if isinstance(x, m.StatusText)]
 
 
 def attitude(boot_ms: int, roll: float) -> Any:
@@ -285,7 +277,7 @@ def test_a_forged_tilt_is_not_published_and_is_recorded() -> None:
     reasons = {verdict.detail.split(":")[0] for verdict in wire.verdicts()}
     assert {v.measurement for v in wire.verdicts()} == {"telemetry"} and "sequence" in reasons
     assert "Terrafix: telemetry of two senders, one ignored" in wire.texts()
-    assert "telemetry refused, sequence" in [x for x in wire.published if isinstance(x, m.LinkStatus)][-1].detail
+    assert "telemetry refused, sequence" in wire.status().detail
 
 
 def test_a_forged_tilt_with_valid_sequence_numbers_is_rejected_by_the_gyroscopes() -> None:
@@ -335,15 +327,12 @@ def test_forged_imu_messages_are_rejected_by_their_time_since_boot() -> None:
 
 
 def test_a_reboot_drops_the_height_of_the_previous_boot() -> None:
-    memory = MemoryWire()
-    edge = MavlinkEdge(LinkSection(), memory, lambda: 0)
-    autopilot = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+    link = WiredEdge()
 
     def published_agl(now_ns: int, boot_ms: int, height_m: float | None = None) -> list[float | None]:
         height = mavlink.MAVLink_global_position_int_message
         heights = [] if height_m is None else [height(boot_ms, 1, 2, 0, round(height_m * 1e3), 0, 0, 0, 0)]
-        memory.arrive(*(packed(x, autopilot) for x in (heartbeat(), *heights, attitude(boot_ms, 0.0))))
-        return [state.agl_m for state in states(edge.poll(now_ns))]
+        return [state.agl_m for state in states(link.receives(now_ns, heartbeat(), *heights, attitude(boot_ms, 0.0)))]
 
     assert published_agl(10 * S, 100_000, 50.0) == [50.0]
     after = [agl for i in range(60) for agl in published_agl(10 * S + 500 * MS + i * 20 * MS, 1000 + i * 20)]

@@ -9,9 +9,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gps_messages import GPS
-from link_port import Port, Speaker, armed, free_port, listening, station_heartbeat
+from link_port import Port, Speaker, free_port, listening
 from link_rig import MS, S
-from link_wire import MemoryWire, attitude, heartbeat, packed, states
+from link_wire import WiredEdge, armed, attitude, heartbeat, packed, states, station_heartbeat
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.admission.served_autopilot import (
@@ -26,7 +26,7 @@ from terrafix.link.admission.served_autopilot import (
 )
 from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter, load_checkpoint
 from terrafix.link.autopilot.ekf_dead_reckoning import EkfState, LastFix
-from terrafix.link.edge import MavlinkEdge, open_edge
+from terrafix.link.edge import open_edge
 from terrafix.link.mavlink.transport import MAX_PEERS, UdpOut
 
 pytestmark = pytest.mark.real_time  # the packets go through the kernel
@@ -70,7 +70,7 @@ def test_the_position_is_sent_to_the_served_autopilot_only(port: Port, ours: Spe
     theirs.received()
     for tenth in range(21, 50):
         port.receives(tenth * 100 * MS, theirs, heartbeat())
-        ours.send(port.address, heartbeat())
+        ours.send(heartbeat(), to=port.address)
         port.edge.on_message(GPS)
     assert len(ours.received("GPS_INPUT")) == 29
     assert theirs.kinds() == set()  # no position, text or request
@@ -93,30 +93,21 @@ def test_a_second_vehicle_causes_one_warning_and_another_when_it_returns(
     warning = "Terrafix: vehicle 9 on our port gets nothing"
     assert port.texts() == [warning]
     assert warning in [x.text for x in ours.received("STATUSTEXT")]
-    assert (
-        f"7 is served, 9 at 127.0.0.1:{theirs.address[1]} gets nothing" in port.detail()
-        and "second sender" not in port.detail()
-    )
+    assert f"7 is served, 9 at 127.0.0.1:{theirs.address[1]} gets nothing" in port.status().detail
+    assert "second sender" not in port.status().detail
     for second in range(6, 20):
         port.receives(second * S, ours, heartbeat())
-    assert "9 at" not in port.detail()
+    assert "9 at" not in port.status().detail
     port.receives(20 * S, theirs, heartbeat())
     assert port.texts() == [warning, warning]
 
 
 def test_a_warning_names_a_vehicle_that_receives_gps_input_over_the_same_wire() -> None:
-    wire = MemoryWire()
-    edge = MavlinkEdge(LinkSection(autopilot_sysid=7), wire, lambda: 0)
+    link = WiredEdge(autopilot_sysid=7)
     for sysid in (7, 9):
-        wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, srcSystem=sysid, srcComponent=1)))
-    published = [*edge.poll(1 * S), *edge.poll(2 * S)]
-    assert [x.text for x in published if isinstance(x, m.StatusText)] == [
-        "Terrafix: vehicle 9 on our link gets GPS_INPUT"
-    ]
-    assert (
-        "reaches them too; give each a link of its own"
-        in [x for x in published if isinstance(x, m.LinkStatus)][-1].detail
-    )
+        link.receives(sysid * S, heartbeat(), sysid=sysid)
+    assert link.texts() == ["Terrafix: vehicle 9 on our link gets GPS_INPUT"]
+    assert "reaches them too; give each a link of its own" in link.status().detail
 
 
 @pytest.mark.parametrize("address", [None, ("10.0.0.7", 14550)])
@@ -141,20 +132,20 @@ def test_autopilot_sysid_selects_the_receiver_of_the_position_on_a_port(ours: Sp
 
 
 def test_autopilot_sysid_selects_the_receiver_of_the_position_on_a_wire() -> None:
-    wire = MemoryWire()
-    edge = MavlinkEdge(LinkSection(autopilot_sysid=9), wire, lambda: 0)
+    link = WiredEdge(autopilot_sysid=9)
     for sysid, positions in ((7, 0), (9, 1)):
-        wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, srcSystem=sysid, srcComponent=1)))
-        list(edge.poll(sysid * S))
-        edge.on_message(GPS)
-        assert len(wire.take("GPS_INPUT")) == positions
+        link.receives(sysid * S, heartbeat(), sysid=sysid)
+        link.edge.on_message(GPS)
+        assert len(link.wire.take("GPS_INPUT")) == positions
+        assert link.status().connected == (sysid == 9) != ("has system id 7, not 9" in link.status().detail)
+    assert link.status().sysid == 9
 
 
 def test_a_point_to_point_link_sends_the_position_before_any_reception() -> None:
     """An autopilot that boots must receive fix type 1."""
-    wire = MemoryWire()
-    MavlinkEdge(LinkSection(), wire, lambda: 0).on_message(GPS)
-    assert len(wire.take("GPS_INPUT")) == 1
+    link = WiredEdge()
+    link.edge.on_message(GPS)
+    assert len(link.wire.take("GPS_INPUT")) == 1
 
 
 # --- silence ---
@@ -175,30 +166,26 @@ def test_the_same_vehicle_is_served_at_a_new_address_after_three_seconds_of_sile
     assert ours.received("GPS_INPUT") == []
 
 
-@pytest.mark.parametrize("flies", [False, True])
-def test_another_vehicle_is_served_after_30_s_of_silence_unless_the_first_was_armed(
-    port: Port, ours: Speaker, theirs: Speaker, flies: bool
+@pytest.mark.parametrize(
+    ("last", "silent_ns", "positions"),
+    [
+        pytest.param([heartbeat(), attitude(1000)], VEHICLE_CHANGE_TIMEOUT_NS, [0, 1], id="30 s of one not armed"),
+        pytest.param([armed(), attitude(1000)], VEHICLE_CHANGE_TIMEOUT_NS, [0, 0], id="never after one in flight"),
+        pytest.param([armed()], HEARTBEATS_ONLY_NS, [0, 1], id="5 s of one that sent heartbeats only"),
+    ],
+)
+def test_another_vehicle_is_served_after_a_silence(
+    port: Port, ours: Speaker, theirs: Speaker, last: list[object], silent_ns: int, positions: list[int]
 ) -> None:
-    port.receives(1 * S, ours, armed() if flies else heartbeat(), attitude(1000))
-    positions = []
-    for at_ns in (1 * S + VEHICLE_CHANGE_TIMEOUT_NS - MS, 1 * S + VEHICLE_CHANGE_TIMEOUT_NS + MS):
-        port.receives(at_ns, theirs, heartbeat())
+    port.receives(1 * S, ours, *last)
+    found = []
+    for at_ns in (1 * S + silent_ns - MS, 1 * S + silent_ns + MS):
+        port.receives(at_ns, theirs, armed())
         port.edge.on_message(GPS)
-        positions.append(len(theirs.received("GPS_INPUT")))
-    assert positions == [0, 0 if flies else 1]
-
-
-def test_another_vehicle_is_served_after_5_s_of_silence_of_one_that_sent_heartbeats_only(
-    port: Port, ours: Speaker, theirs: Speaker
-) -> None:
-    port.receives(1 * S, theirs, armed())
-    positions = []
-    for at_ns in (1 * S + HEARTBEATS_ONLY_NS - MS, 1 * S + HEARTBEATS_ONLY_NS + MS):
-        port.receives(at_ns, ours, armed())
-        port.edge.on_message(GPS)
-        positions.append(len(ours.received("GPS_INPUT")))
-    assert positions == [0, 1]
-    assert port.texts() == ["Terrafix: no fix: camera on vehicle 7, 9?", "Terrafix: vehicle 7 is served, 9 is not"]
+        found.append(len(theirs.received("GPS_INPUT")))
+    assert found == positions
+    change = ["Terrafix: vehicle 9 is served, 7 is not"] if positions[1] else []
+    assert [text for text in port.texts() if "served" in text] == change
 
 
 @pytest.mark.parametrize(("first", "other", "changes"), [("heartbeats", "all", True), ("all", "all", False)])
@@ -254,30 +241,23 @@ def test_a_restarted_link_serves_the_address_from_the_checkpoint(
 
 
 def test_a_checkpoint_of_another_system_id_than_configured_is_ignored(tmp_path: Path) -> None:
-    checkpoint_writer = CheckpointWriter(tmp_path / "link.checkpoint")
-    checkpoint_writer.on_heartbeat(ArmedAutopilot(7, 3, 1))
-    config = LinkSection(autopilot_sysid=9)
-    edge = MavlinkEdge(
-        config, MemoryWire(), lambda: 0, checkpoint_writer=CheckpointWriter(tmp_path / "link.checkpoint")
-    )
-    assert not [x for x in edge.poll(S) if isinstance(x, m.LinkStatus)][-1].connected
+    CheckpointWriter(tmp_path / "link.checkpoint").on_heartbeat(ArmedAutopilot(7, 3, 1))
+    link = WiredEdge(checkpoint=tmp_path / "link.checkpoint", autopilot_sysid=9)
+    link.poll(S)
+    assert not link.status().connected
 
 
 # --- forgers ---
 
 
 def test_timesync_responses_of_another_component_are_ignored() -> None:
-    wire, offsets = MemoryWire(), []
-    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
+    link, offsets = WiredEdge(), []
     for begin_ns, sender in ((10 * S, 191), (20 * S, 1)):
-        mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=sender)
-        beat = packed(heartbeat(), mavlink.MAVLink(None, srcSystem=7, srcComponent=1))
-        published: list[m.Message] = []
-        for i in range(20):
-            wire.arrive(*(packed(mavlink.MAVLink_timesync_message(99 * S, t.ts1), mav) for t in wire.take("TIMESYNC")))
-            wire.arrive(*([beat] if i == 0 else []))
-            published += edge.poll(begin_ns + i * 100 * MS)
-        offsets.append([x for x in published if isinstance(x, m.LinkStatus)][-1].time_offset_ms)
+        link.receives(begin_ns, heartbeat())
+        for i in range(1, 20):
+            replies = [mavlink.MAVLink_timesync_message(99 * S, t.ts1) for t in link.wire.take("TIMESYNC")]
+            link.receives(begin_ns + i * 100 * MS, *replies, compid=sender)
+        offsets.append(link.status().time_offset_ms)
     assert offsets[0] is None and offsets[1] is not None
 
 
@@ -292,7 +272,7 @@ def test_an_incomplete_packet_of_one_sender_does_not_consume_packets_of_another(
 def test_bytes_outside_of_packets_are_counted(port: Port, ours: Speaker) -> None:
     ours.socket.sendto(b"garbage", port.address)
     port.receives(1 * S, ours, heartbeat())
-    assert [x for x in port.published if isinstance(x, m.LinkStatus)][-1].bad == len(b"garbage")
+    assert port.status().bad == len(b"garbage")
 
 
 def test_broadcasts_go_to_the_eight_most_recent_senders(port: Port) -> None:
@@ -333,7 +313,7 @@ def test_a_second_sender_with_the_autopilots_id_is_rejected_and_gets_nothing(por
     assert (verdict.measurement, verdict.verdict) == ("telemetry", m.Verdict.IMPLAUSIBLE)
     assert f"127.0.0.1:{forger.address[1]}" in verdict.detail
     port.receives(103 * S, ours, heartbeat())
-    assert f"a second sender of system 7 at 127.0.0.1:{forger.address[1]} is ignored" in port.detail()
+    assert f"a second sender of system 7 at 127.0.0.1:{forger.address[1]} is ignored" in port.status().detail
 
 
 def test_a_rejected_address_is_accepted_as_a_ground_station_after_its_timeout(port: Port, ours: Speaker) -> None:
@@ -354,7 +334,7 @@ def test_udpout_receives_from_its_address_only_and_reports_other_senders(ours: S
     with Speaker(7) as forger:
         published = port.receives(1 * S, forger, heartbeat(), attitude(1000), station_heartbeat(), ORIGIN_HERE)
         assert states(published) == [] and hints(published) == []
-        assert f"4 packets ignored, the last from 127.0.0.1:{forger.address[1]}" in port.detail()
+        assert f"4 packets ignored, the last from 127.0.0.1:{forger.address[1]}" in port.status().detail
     assert states(port.receives(2 * S, ours, heartbeat(), attitude(1100)))
     edge.close()
 

@@ -10,12 +10,10 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_wire import MemoryWire, packed
-from terrafix.core.config import LinkSection
+from gps_messages import GPS
+from link_wire import WiredEdge, heartbeat
 from terrafix.core.geodesy import LocalFrame
-from terrafix.link.autopilot.checkpoint import CheckpointWriter
 from terrafix.link.autopilot.ekf_dead_reckoning import EkfState, LastFix, _dead_reckoning_since
-from terrafix.link.edge import MavlinkEdge
 from terrafix.messages import EkfDeadReckoning, GpsInput, Message
 
 S, MS = 1_000_000_000, 1_000_000
@@ -57,25 +55,9 @@ def status(flags: int = HEALTHY_FLAGS) -> Any:
 def fix(t_s: float, fix_type: int = 3) -> GpsInput:
     east_m, north_m, ve, vn = truth(t_s)
     lat_deg, lon_deg = PLACE.to_wgs84(east_m, north_m)
-    return GpsInput(
-        t_ns=round(t_s * S),
-        fix_type=fix_type,
-        time_week=2445,
-        time_week_ms=0,
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
-        alt_amsl_m=500.0,
-        hdop=1.0,
-        vdop=1.0,
-        vn_mps=vn,
-        ve_mps=ve,
-        vd_mps=-1.0,
-        speed_accuracy_mps=0.4,
-        horiz_accuracy_m=5.0,
-        vert_accuracy_m=5.0,
-        satellites_visible=9,
-        estimate_age_ms=300.0,
-    )
+    velocity = {"vn_mps": vn, "ve_mps": ve, "vd_mps": -1.0, "speed_accuracy_mps": 0.4}
+    where = {"lat_deg": lat_deg, "lon_deg": lon_deg, "horiz_accuracy_m": 5.0}
+    return msgspec.structs.replace(GPS, t_ns=round(t_s * S), fix_type=fix_type, **where, **velocity)
 
 
 class Autopilot:
@@ -83,28 +65,27 @@ class Autopilot:
 
     def __init__(self, checkpoint_file: Path) -> None:
         self._checkpoint_file = checkpoint_file
-        self._mav = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
         self.restart()
 
     def restart(self) -> None:
-        self.wire = MemoryWire()
-        config = msgspec.structs.replace(LinkSection(), gps_id=GPS_ID)
-        self.edge = MavlinkEdge(config, self.wire, lambda: 0, checkpoint_writer=CheckpointWriter(self._checkpoint_file))
+        self.link = WiredEdge(checkpoint=self._checkpoint_file, gps_id=GPS_ID)
 
     def sends(self, t_s: float, *messages: Any) -> list[Message]:
-        self.wire.arrive(*(packed(message, self._mav) for message in messages))
-        return list(self.edge.poll(round(t_s * S)))
+        return self.link.receives(round(t_s * S), *messages)
+
+    def requested(self) -> list[int]:
+        """-> ids of messages that were requested once, since the last call."""
+        commands = self.link.wire.take("COMMAND_LONG")
+        return [int(x.param1) for x in commands if x.command == mavlink.MAV_CMD_REQUEST_MESSAGE]
 
     def fly_until_killed(self, *, receiver_fix: int = 1) -> None:
         """Sends fixes at 10 Hz and EKF positions at 5 Hz until KILLED_S."""
-        armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-        plane, ardupilot = mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-        beat = mavlink.MAVLink_heartbeat_message(plane, ardupilot, armed, 0, mavlink.MAV_STATE_ACTIVE, 3)
+        beat = heartbeat(mode=mavlink.MAV_MODE_FLAG_SAFETY_ARMED, kind=mavlink.MAV_TYPE_FIXED_WING)
         self.sends(0.0, beat, receiver(receiver_fix), status())
         for tenth in range(round(KILLED_S * 10) + 1):
             if tenth % 2:
                 self.sends(0.1 * tenth - 0.04, ekf_position(0.1 * tenth - 0.04))
-            self.edge.on_message(fix(0.1 * tenth))
+            self.link.edge.on_message(fix(0.1 * tenth))
 
 
 def dead_reckonings(messages: Iterable[Message]) -> list[EkfDeadReckoning]:
@@ -116,13 +97,19 @@ def autopilot(tmp_path: Path) -> Autopilot:
     return Autopilot(tmp_path / "link.checkpoint")
 
 
-def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(autopilot: Autopilot) -> None:
+@pytest.fixture
+def restarted(autopilot: Autopilot) -> Autopilot:
+    """The link was killed in flight and has started again."""
     autopilot.fly_until_killed()
     autopilot.restart()
+    return autopilot
+
+
+def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(restarted: Autopilot) -> None:
     assert not dead_reckonings(
-        autopilot.sends(RESTARTED_S - 0.2, ekf_position(RESTARTED_S - 0.2))
+        restarted.sends(RESTARTED_S - 0.2, ekf_position(RESTARTED_S - 0.2))
     )  # EKF status and receivers are not known yet
-    (message,) = dead_reckonings(autopilot.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S)))
+    (message,) = dead_reckonings(restarted.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S)))
     since_s = RESTARTED_S - message.duration_s
     assert KILLED_S - 0.3 < since_s <= KILLED_S and message.t_ns == round(RESTARTED_S * S)
     # Position and velocity are those of our fix at the time of the EKF state.
@@ -136,16 +123,11 @@ def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(autopilot: Aut
     assert message.delta_v_mps == pytest.approx((now[2] - before[2], now[3] - before[3], 0.0), abs=0.02)
 
 
-def test_a_restarted_link_requests_the_slow_messages(autopilot: Autopilot) -> None:
-    autopilot.fly_until_killed()
-    autopilot.restart()
-    autopilot.sends(RESTARTED_S, ekf_position(RESTARTED_S))
-    requested = {
-        int(x.param1) for x in autopilot.wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_REQUEST_MESSAGE
-    }
-    assert requested == {193, 24, 124}  # EKF_STATUS_REPORT, GPS_RAW_INT, GPS2_RAW
-    autopilot.sends(RESTARTED_S + 0.5, status(), receiver(1))
-    assert not any(x.command == mavlink.MAV_CMD_REQUEST_MESSAGE for x in autopilot.wire.take("COMMAND_LONG"))
+def test_a_restarted_link_requests_the_slow_messages(restarted: Autopilot) -> None:
+    restarted.sends(RESTARTED_S, ekf_position(RESTARTED_S))
+    assert set(restarted.requested()) == {193, 24, 124}  # EKF_STATUS_REPORT, GPS_RAW_INT, GPS2_RAW
+    restarted.sends(RESTARTED_S + 0.5, status(), receiver(1))
+    assert not restarted.requested()
 
 
 @pytest.mark.parametrize(("before", "after"), [(3, 1), (1, 3)])
@@ -160,33 +142,27 @@ def test_no_dead_reckoning_is_published_while_another_receiver_has_a_fix(
     )
 
 
-def test_no_dead_reckoning_is_published_before_the_known_receiver_is_received(autopilot: Autopilot) -> None:
-    autopilot.fly_until_killed()
-    autopilot.restart()
-    assert not dead_reckonings(autopilot.sends(RESTARTED_S, status(), ekf_position(RESTARTED_S)))
-    assert dead_reckonings(autopilot.sends(RESTARTED_S + 0.2, receiver(1), ekf_position(RESTARTED_S + 0.2)))
+def test_no_dead_reckoning_is_published_before_the_known_receiver_is_received(restarted: Autopilot) -> None:
+    assert not dead_reckonings(restarted.sends(RESTARTED_S, status(), ekf_position(RESTARTED_S)))
+    assert dead_reckonings(restarted.sends(RESTARTED_S + 0.2, receiver(1), ekf_position(RESTARTED_S + 0.2)))
 
 
 @pytest.mark.parametrize("flags", [mavlink.EKF_ATTITUDE, HEALTHY_FLAGS | mavlink.EKF_CONST_POS_MODE])
-def test_no_dead_reckoning_is_published_without_a_valid_ekf_velocity(autopilot: Autopilot, flags: int) -> None:
-    autopilot.fly_until_killed()
-    autopilot.restart()
-    assert not dead_reckonings(autopilot.sends(RESTARTED_S, status(flags), receiver(1), ekf_position(RESTARTED_S)))
+def test_no_dead_reckoning_is_published_without_a_valid_ekf_velocity(restarted: Autopilot, flags: int) -> None:
+    assert not dead_reckonings(restarted.sends(RESTARTED_S, status(flags), receiver(1), ekf_position(RESTARTED_S)))
 
 
-def test_no_dead_reckoning_is_published_after_a_reboot_or_more_than_a_minute(autopilot: Autopilot) -> None:
-    autopilot.fly_until_killed()
-    autopilot.restart()
+def test_no_dead_reckoning_is_published_after_a_reboot_or_more_than_a_minute(restarted: Autopilot) -> None:
     assert not dead_reckonings(
-        autopilot.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S, boot_s=1.0))
+        restarted.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S, boot_s=1.0))
     )
-    assert not dead_reckonings(autopilot.sends(80.0, status(), receiver(1), ekf_position(80.0)))
+    assert not dead_reckonings(restarted.sends(80.0, status(), receiver(1), ekf_position(80.0)))
 
 
 def test_no_dead_reckoning_is_published_while_we_send_a_fix(autopilot: Autopilot) -> None:
     autopilot.fly_until_killed()
     assert not dead_reckonings(autopilot.sends(KILLED_S + 0.1, ekf_position(KILLED_S + 0.1)))
-    autopilot.edge.on_message(fix(KILLED_S + 0.2, fix_type=1))
+    autopilot.link.edge.on_message(fix(KILLED_S + 0.2, fix_type=1))
     assert dead_reckonings(autopilot.sends(KILLED_S + 0.3, status(), receiver(1), ekf_position(KILLED_S + 0.3)))
 
 

@@ -10,10 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from structlog.testing import capture_logs
 
 from link_rig import S, estimate, every, fly, texts
-from link_wire import MemoryWire, heartbeat, packed
+from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
-from terrafix.core.config import LinkSection
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.node import LinkNode
 from terrafix.link.status import StatusLog
 
@@ -57,29 +55,29 @@ def test_no_text_without_a_fix_or_without_a_recent_ekf_status() -> None:
     assert autopilot_texts(lambda second: NOT_USING_FLAGS if second < 3 else None) == []
 
 
+def received_status(*messages: Any) -> tuple[m.EkfStatus, set[int]]:
+    """-> the one EkfStatus of these messages, and the ids of the streams that the link requests."""
+    link = WiredEdge()
+    (status,) = [x for x in link.receives(S, *messages) if isinstance(x, m.EkfStatus)]
+    commands = link.wire.take("COMMAND_LONG")
+    return status, {int(x.param1) for x in commands if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+
+
 def test_ekf_status_report_is_requested_and_recorded() -> None:
-    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
     report = mavlink.MAVLink_ekf_status_report_message(USING_FLAGS, 0.2, 0.3, 0.1, 0.1, 0.0)
     broken = mavlink.MAVLink_ekf_status_report_message(USING_FLAGS, float("nan"), 0.3, 0.1, 0.1, 0.0)
-    wire.arrive(packed(heartbeat(), autopilot), packed(report, autopilot), packed(broken, autopilot))
-    (status,) = [x for x in edge.poll(S) if isinstance(x, m.EkfStatus)]
+    status, requested = received_status(heartbeat(), report, broken)
     assert (status.flags, status.t_ns) == (USING_FLAGS, S)
     assert (status.velocity_ratio, status.position_ratio) == pytest.approx((0.2, 0.3))
-    requested = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     assert mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT in requested
 
 
 def test_px4_estimator_status_is_converted_to_filter_status() -> None:
-    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
     flags = USING_FLAGS | mavlink.ESTIMATOR_GPS_GLITCH  # the same bit as ArduPilot's EKF_UNINITIALIZED
     report = mavlink.MAVLink_estimator_status_message(0, flags, math.nan, 0.3, 0.1, 0.1, 0.0, 0.0, 1.0, 1.0)
-    wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_PX4), autopilot), packed(report, autopilot))
-    (status,) = [x for x in edge.poll(S) if isinstance(x, m.EkfStatus)]
+    status, requested = received_status(heartbeat(mavlink.MAV_AUTOPILOT_PX4), report)
     assert (status.flags, status.velocity_ratio) == (USING_FLAGS, 0.0)
     assert status.position_ratio == pytest.approx(0.3)
-    requested = {int(x.param1) for x in wire.take("COMMAND_LONG") if x.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     assert {mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU} <= requested
     assert not {mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, mavlink.MAVLINK_MSG_ID_RAW_IMU} & requested
 
@@ -121,11 +119,9 @@ def test_an_autopilot_that_connects_immediately_is_one_log_line() -> None:
 
 
 def test_an_unknown_firmware_is_reported() -> None:
-    wire = MemoryWire()
-    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
-    wire.arrive(packed(heartbeat(mavlink.MAV_AUTOPILOT_GENERIC), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)))
-    (found,) = [x for x in edge.poll(S) if isinstance(x, m.LinkStatus)]
-    assert "neither ArduPilot nor PX4" in found.detail
+    link = WiredEdge()
+    link.receives(S, heartbeat(mavlink.MAV_AUTOPILOT_GENERIC))
+    assert "neither ArduPilot nor PX4" in link.status().detail
 
 
 # --- the priority of the process ---

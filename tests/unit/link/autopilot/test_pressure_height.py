@@ -7,11 +7,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gps_messages import NO_FIX
-from link_wire import MemoryWire, attitude, packed, states
-from terrafix.core.config import LinkSection
-from terrafix.link.autopilot.checkpoint import CheckpointWriter
+from link_wire import WiredEdge, armed, attitude, heartbeat, states
 from terrafix.link.autopilot.pressure_height import PRESSURE_TIMEOUT_NS, PressureHeight, isa_height_m
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.mavlink.message_rates import streams_of_firmware
 
 S, MS = 1_000_000_000, 1_000_000
@@ -35,63 +32,72 @@ class Vehicle:
     """An autopilot on a connection in memory, with separate heights of its EKF and its barometer."""
 
     def __init__(self, checkpoint_file: Path | None = None) -> None:
-        self.wire, self.mav = MemoryWire(), mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
         self.checkpoint_file, self.seconds, self.booted_s = checkpoint_file, 100.0, 0.0
         self.restart()
 
     def restart(self) -> None:
         """Starts a new link process."""
-        self.edge = MavlinkEdge(
-            LinkSection(), self.wire, lambda: 0, checkpoint_writer=CheckpointWriter(self.checkpoint_file)
-        )
+        self.link = WiredEdge(checkpoint=self.checkpoint_file)
 
     def receive(
-        self, ekf_height_m: float | None, above_m: float | None, *, armed: bool, seconds: float = 1.0
+        self, ekf_height_m: float | None, above_m: float | None, *, flies: bool = True, seconds: float = 1.0
     ) -> float | None:
         """The link receives these heights at 5 Hz; None: not sent. -> the last published height."""
-        packets: list[Any] = []
         for _ in range(round(seconds * 5)):
             self.seconds += 0.2
-            boot_ms, ardupilot = round((self.seconds - self.booted_s) * 1e3), mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-            packets = [mavlink.MAVLink_heartbeat_message(2, ardupilot, 128 if armed else 0, 0, 4, 3)]
+            boot_ms = round((self.seconds - self.booted_s) * 1e3)
+            packets: list[Any] = [armed() if flies else heartbeat()]
             if above_m is not None:
                 packets.append(mavlink.MAVLink_scaled_pressure_message(boot_ms, pressure_at(above_m), 0.0, 3500))
             if ekf_height_m is not None:
                 heights = (round(500e3 + ekf_height_m * 1e3), round(ekf_height_m * 1e3))
                 packets.append(mavlink.MAVLink_global_position_int_message(boot_ms, 1, 2, *heights, 0, 0, 0, 0))
-            self.wire.arrive(*(packed(x, self.mav) for x in (*packets, attitude(boot_ms))))
-            heights = [state.agl_m for state in states(self.edge.poll(round(self.seconds * S)))]
-        return heights[-1]
+            published = self.link.receives(round(self.seconds * S), *packets, attitude(boot_ms))
+        return states(published)[-1].agl_m
 
 
-def test_an_ekf_height_displaced_by_our_velocity_does_not_change_the_height() -> None:
+GROUND = [(0.0, 0.0, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("on_ground", "flight"),
+    [
+        pytest.param(
+            [(0.0, 0.0, 10.0)],
+            [(50.0 + ekf_error_m, 50.0, 1.0, 50.0) for ekf_error_m in range(20)],
+            id="an EKF height that our velocity displaces does not change it",
+        ),
+        pytest.param(
+            GROUND,
+            [(60.0, 50.0, 1.0, 50.0), (60.0, None, 2.0, 60.0), (60.0, 50.0, 1.0, 50.0)],
+            id="without pressure it is the EKF's",
+        ),
+        pytest.param(
+            GROUND,
+            [(50.0, 50.0, 1.0, 50.0), (None, 60.0, 3.0, 60.0)],
+            id="without EKF heights it continues by pressure",
+        ),
+        pytest.param(
+            [*GROUND, (0.0, 8.0, 60.0)],  # the pressure has fallen by 1 hPa
+            [(50.0, 58.0, 1.0, 50.0)],
+            id="on the ground the zero follows the air pressure",
+        ),
+        pytest.param(
+            [],
+            [(53.0, 50.0, 1.0, 53.0), (80.0, 60.0, 1.0, 63.0)],
+            id="a link that starts in the air takes the zero from the EKF once",
+        ),
+    ],
+)
+def test_the_height_is_that_above_take_off_by_pressure(
+    on_ground: list[tuple[float, float, float]], flight: list[tuple[float | None, float | None, float, float]]
+) -> None:
+    """Steps: height of the EKF, height by pressure [m], duration [s], and in flight the published height."""
     vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, armed=False, seconds=10.0)
-    assert vehicle.receive(50.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
-    for ekf_error_m in range(1, 20):
-        assert vehicle.receive(50.0 + ekf_error_m, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
-
-
-def test_without_pressure_the_height_is_the_ekf_height() -> None:
-    vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, armed=False)
-    assert vehicle.receive(60.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
-    assert vehicle.receive(60.0, None, armed=True, seconds=2.0) == 60.0
-    assert vehicle.receive(60.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
-
-
-def test_without_ekf_heights_the_height_continues_by_pressure() -> None:
-    vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, armed=False)
-    vehicle.receive(50.0, 50.0, armed=True)
-    assert vehicle.receive(None, 60.0, armed=True, seconds=3.0) == pytest.approx(60.0, abs=0.1)
-
-
-def test_on_the_ground_the_zero_follows_the_air_pressure() -> None:
-    vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, armed=False)
-    vehicle.receive(0.0, 8.0, armed=False, seconds=60.0)  # the pressure has fallen by 1 hPa
-    assert vehicle.receive(50.0, 58.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    for ekf_m, above_m, seconds in on_ground:
+        vehicle.receive(ekf_m, above_m, flies=False, seconds=seconds)
+    for ekf, above, seconds, height_m in flight:
+        assert vehicle.receive(ekf, above, seconds=seconds) == pytest.approx(height_m, abs=0.1)
 
 
 def test_one_bad_reading_on_the_ground_changes_the_zero_by_a_tenth() -> None:
@@ -103,27 +109,21 @@ def test_one_bad_reading_on_the_ground_changes_the_zero_by_a_tenth() -> None:
     assert height.height_m(21 * S) == pytest.approx(48.0, abs=0.1)  # a tenth of it
 
 
-def test_a_link_started_in_the_air_takes_the_zero_from_the_ekf_once() -> None:
-    vehicle = Vehicle()
-    assert vehicle.receive(53.0, 50.0, armed=True) == pytest.approx(53.0, abs=0.1)
-    assert vehicle.receive(80.0, 60.0, armed=True) == pytest.approx(63.0, abs=0.1)
-
-
 def test_a_rebooted_autopilot_gets_a_new_zero() -> None:
     vehicle = Vehicle()
-    vehicle.receive(0.0, 0.0, armed=False)
-    assert vehicle.receive(50.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    vehicle.receive(0.0, 0.0, flies=False)
+    assert vehicle.receive(50.0, 50.0) == pytest.approx(50.0, abs=0.1)
     vehicle.booted_s = vehicle.seconds
-    assert vehicle.receive(3.0, 50.0, armed=True, seconds=3.0) == pytest.approx(3.0, abs=0.1)
+    assert vehicle.receive(3.0, 50.0, seconds=3.0) == pytest.approx(3.0, abs=0.1)
 
 
 def test_a_restarted_link_restores_the_zero_from_the_checkpoint(tmp_path: Path) -> None:
     vehicle = Vehicle(tmp_path / "link.checkpoint")
-    vehicle.receive(0.0, 0.0, armed=False)
-    vehicle.receive(55.0, 50.0, armed=True)
-    vehicle.edge.on_message(NO_FIX)
+    vehicle.receive(0.0, 0.0, flies=False)
+    vehicle.receive(55.0, 50.0)
+    vehicle.link.edge.on_message(NO_FIX)
     vehicle.restart()
-    assert vehicle.receive(55.0, 50.0, armed=True) == pytest.approx(50.0, abs=0.1)
+    assert vehicle.receive(55.0, 50.0) == pytest.approx(50.0, abs=0.1)
 
 
 @pytest.mark.parametrize("armed", [True, None])

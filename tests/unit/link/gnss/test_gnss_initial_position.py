@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from link_rig import LAT, LON, MS, S, estimate, fly, texts
+from origins import origin_of
 from terrafix import messages as m
 from terrafix.link.gnss.initial_position import (
     MAX_CLAIMED_SIGMA_M,
@@ -18,15 +19,12 @@ from terrafix.link.gnss.spoofing_detector import DEFAULT_RECEIVER_SIGMA_M, MIN_R
 from terrafix.link.integrity.output_predictor import distance_m, offset
 from terrafix.link.node import LinkNode
 
-CAMERA = m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0)
 UNKNOWN_START_SIGMA_M = 2000.0
 Where = Callable[[float], tuple[float, float] | None]  # s -> metres east and north; None: no fix
 
 
 def origin(start_sigma_m: float = UNKNOWN_START_SIGMA_M) -> m.Origin:
-    sigmas = {"yaw_sigma_deg": 1.0, "agl_sigma_m": 1.0, "attitude_sigma_deg": 1.0}
-    place = {"lat_deg": LAT, "lon_deg": LON, "ground_amsl_m": 500.0, "start_sigma_m": start_sigma_m}
-    return m.Origin(t_ns=0, camera=CAMERA, **place, **sigmas)
+    return origin_of(m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0), start_sigma_m=start_sigma_m)
 
 
 def here(_: float) -> tuple[float, float]:

@@ -37,6 +37,13 @@ def seconds(value_s: float) -> int:
     return round(value_s / DT_S)
 
 
+def quiet_predictor(drift_sigma_m: float = NO_DRIFT_SIGMA_M) -> OffsetPredictor:
+    """-> a predictor after ten minutes without an offset."""
+    predictor = OffsetPredictor()
+    p_values(predictor, [0j] * seconds(600.0), drift_sigma_m=drift_sigma_m)
+    return predictor
+
+
 def test_the_p_value_is_that_of_a_bivariate_student_t() -> None:
     """Compared with drawn numbers. With the prior alone there are two degrees of freedom for each of its samples."""
     predictor = OffsetPredictor()
@@ -64,12 +71,11 @@ def test_a_constant_offset_is_learnt_and_a_change_of_it_is_detected() -> None:
 
 
 def test_the_drift_against_our_velocity_detects_a_drag_off_earlier() -> None:
-    drag, quiet = 1.0 * DT_S, [0j] * seconds(600.0)
+    drag = 1.0 * DT_S
     walking, drifts = [drag * k + 0j for k in range(seconds(40.0))], [drag + 0j] * seconds(40.0)
     detected_s = []
     for drift_sigma_m in (NO_DRIFT_SIGMA_M, 18.0):
-        predictor = OffsetPredictor()
-        p_values(predictor, quiet, drift_sigma_m=drift_sigma_m)
+        predictor = quiet_predictor(drift_sigma_m)
         values = p_values(predictor, walking, drifts=drifts, drift_sigma_m=drift_sigma_m)
         detected_s.append(next(k for k, p_value in enumerate(values) if p_value < DRAG_P_VALUE) * DT_S)
     assert detected_s[1] < detected_s[0] - 2.0
@@ -80,8 +86,7 @@ def test_an_offset_without_drift_of_the_receiver_has_a_larger_p_value() -> None:
     walking = [0.6 * DT_S * k + 0j for k in range(seconds(40.0))]
     smallest = []
     for drift_sigma_m in (NO_DRIFT_SIGMA_M, 18.0):
-        predictor = OffsetPredictor()
-        p_values(predictor, [0j] * seconds(600.0), drift_sigma_m=drift_sigma_m)
+        predictor = quiet_predictor(drift_sigma_m)
         smallest.append(min(p_values(predictor, walking, drift_sigma_m=drift_sigma_m)))
     assert smallest[1] > 5.0 * smallest[0]
 
@@ -103,8 +108,7 @@ def test_the_combined_prediction_has_the_variance_of_drawn_errors() -> None:
 
 
 def test_a_drag_off_is_not_learnt_within_the_horizon() -> None:
-    predictor = OffsetPredictor()
-    p_values(predictor, [0j] * seconds(600.0))
+    predictor = quiet_predictor()
     _, before_m = predictor.update(10.0 + 0j, 6.0, 0j, NO_DRIFT_SIGMA_M, DT_S, learn=True)
     p_values(predictor, [10.0 + 0j] * seconds(HORIZON_S - 5.0))
     _, after_m = predictor.update(10.0 + 0j, 6.0, 0j, NO_DRIFT_SIGMA_M, DT_S, learn=True)
@@ -123,8 +127,7 @@ def test_after_a_flight_with_small_errors_the_claimed_error_is_still_no_alarm() 
 
 
 def test_after_an_interval_with_a_large_sigma_there_is_no_false_alarm() -> None:
-    predictor = OffsetPredictor()
-    p_values(predictor, [0j] * seconds(600.0))
+    predictor = quiet_predictor()
     drift = [complex(0.5 * DT_S * k, 0.0) for k in range(seconds(60.0))]
     blind = [predictor.update(x, math.hypot(6.0, abs(x)), 0j, NO_DRIFT_SIGMA_M, DT_S, learn=True)[0] for x in drift]
     back = p_values(predictor, [0j] * seconds(120.0))

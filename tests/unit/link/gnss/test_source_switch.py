@@ -10,10 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from autopilot_rig import FRAME, HEIGHT_M, Rig, at_5_hz, real_fix
 from companion_rig import Companion
 from link_rig import S
-from link_wire import MemoryWire, heartbeat, packed
+from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.gnss.previous_source import FILE_NAME, PreviousSource, PreviousSourceFile
 from terrafix.link.gnss.source_switch import SourceSwitch
 from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
@@ -51,6 +50,21 @@ class SpoofedFlight(Companion):
         return [(x.vision, x.fallback) for x in self.published if isinstance(x, m.PositionSource)]
 
 
+@pytest.fixture
+def switched(tmp_path: Path) -> SpoofedFlight:
+    """A flight that the link has switched to vision."""
+    flight = SpoofedFlight(tmp_path)
+    flight.fly(20.0)
+    assert flight.rig.autopilot.used_gps == 1
+    return flight
+
+
+def switch_to_vision(file: PreviousSourceFile | None = None) -> SourceSwitch:
+    switch = SourceSwitch(1, file)
+    switch.set_target(m.PositionSource(t_ns=0, vision=True, receiver=0), ("gps_input",))
+    return switch
+
+
 def no_images(_t_s: float) -> None:
     return None
 
@@ -77,8 +91,7 @@ def test_after_the_spoofing_the_autopilot_has_the_parameters_that_it_had_before(
 
 
 def test_the_parameters_are_on_the_disk_before_they_are_changed(tmp_path: Path) -> None:
-    switch = SourceSwitch(1, PreviousSourceFile(tmp_path))
-    switch.set_target(m.PositionSource(t_ns=0, vision=True, receiver=0), ("gps_input",))
+    switch = switch_to_vision(PreviousSourceFile(tmp_path))
     reads = list(switch.requests(1, 0))
     assert {x.get_type() for x in reads} == {"PARAM_REQUEST_READ"}
     assert not (tmp_path / FILE_NAME).exists()
@@ -93,50 +106,41 @@ def test_the_parameters_are_on_the_disk_before_they_are_changed(tmp_path: Path) 
     assert PreviousSourceFile(tmp_path).load() == PreviousSource(1, BEFORE)
 
 
-def test_a_killed_terrafix_leaves_the_receiver_to_the_autopilot(tmp_path: Path) -> None:
-    flight = SpoofedFlight(tmp_path)
-    flight.fly(20.0)
-    assert flight.rig.autopilot.used_gps == 1
-    flight.rig.fly(6.0)  # nothing is sent any more
-    assert flight.rig.autopilot.used_gps == 0
+def test_a_killed_terrafix_leaves_the_receiver_to_the_autopilot(switched: SpoofedFlight) -> None:
+    switched.rig.fly(6.0)  # nothing is sent any more
+    assert switched.rig.autopilot.used_gps == 0
 
 
-def test_a_restarted_link_restores_the_receiver_when_it_is_trusted_again(tmp_path: Path) -> None:
-    flight = SpoofedFlight(tmp_path)
-    flight.fly(20.0)
-    flight.honest_s = 20.0
-    flight.start(ACT)  # the earlier process was killed, and closed nothing
-    flight.fly(22.0)
-    assert flight.parameters["GPS_PRIMARY"] == 1.0, "what it has restored is not yet known to be right"
-    flight.fly(60.0)
-    assert flight.parameters == BEFORE
-    assert flight.rig.autopilot.used_gps == 0
+def test_a_restarted_link_restores_the_receiver_when_it_is_trusted_again(switched: SpoofedFlight) -> None:
+    switched.honest_s = 20.0
+    switched.start(ACT)  # the earlier process was killed, and closed nothing
+    switched.fly(22.0)
+    assert switched.parameters["GPS_PRIMARY"] == 1.0, "what it has restored is not yet known to be right"
+    switched.fly(60.0)
+    assert switched.parameters == BEFORE
+    assert switched.rig.autopilot.used_gps == 0
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_a_vehicle_that_lands_during_the_spoofing_gets_its_parameters_back(tmp_path: Path, restarted: bool) -> None:
-    flight = SpoofedFlight(tmp_path)
-    flight.fly(20.0)
+def test_a_vehicle_that_lands_during_the_spoofing_gets_its_parameters_back(
+    switched: SpoofedFlight, tmp_path: Path, restarted: bool
+) -> None:
     if restarted:
-        flight.start(ACT)
-    flight.disarm()
-    flight.fly(25.0)
-    assert flight.parameters == BEFORE
+        switched.start(ACT)
+    switched.disarm()
+    switched.fly(25.0)
+    assert switched.parameters == BEFORE
     assert not (tmp_path / FILE_NAME).exists()
 
 
-def test_an_ordered_stop_restores_the_parameters(tmp_path: Path) -> None:
-    flight = SpoofedFlight(tmp_path)
-    flight.fly(20.0)
-    flight.edge.close()
-    assert flight.parameters == BEFORE
+def test_an_ordered_stop_restores_the_parameters(switched: SpoofedFlight, tmp_path: Path) -> None:
+    switched.edge.close()
+    assert switched.parameters == BEFORE
     assert not (tmp_path / FILE_NAME).exists()
 
 
-def test_after_a_loss_of_power_the_next_start_restores_the_parameters(tmp_path: Path) -> None:
-    flight = SpoofedFlight(tmp_path)
-    flight.fly(20.0)
-    left = flight.parameters
+def test_after_a_loss_of_power_the_next_start_restores_the_parameters(switched: SpoofedFlight, tmp_path: Path) -> None:
+    left = switched.parameters
     next_day = SpoofedFlight(tmp_path, left, spoofed_m=0.0)  # the autopilot saves its parameters
     next_day.disarm()
     next_day.rig.fly(5.0)
@@ -146,12 +150,10 @@ def test_after_a_loss_of_power_the_next_start_restores_the_parameters(tmp_path: 
     assert not (tmp_path / FILE_NAME).exists()
 
 
-def test_a_link_that_no_longer_switches_restores_what_an_earlier_one_has_switched(tmp_path: Path) -> None:
-    flight = SpoofedFlight(tmp_path)
-    flight.fly(20.0)
-    flight.start(LinkSection(gps_id=1, gnss="off"))
-    flight.fly(22.0)
-    assert flight.parameters == BEFORE
+def test_a_link_that_no_longer_switches_restores_what_an_earlier_one_has_switched(switched: SpoofedFlight) -> None:
+    switched.start(LinkSection(gps_id=1, gnss="off"))
+    switched.fly(22.0)
+    assert switched.parameters == BEFORE
 
 
 def test_without_a_fix_of_ours_the_autopilot_is_kept_off_a_spoofed_receiver_for_35_seconds(tmp_path: Path) -> None:
@@ -168,8 +170,7 @@ def test_without_a_fix_of_ours_the_autopilot_is_kept_off_a_spoofed_receiver_for_
 
 
 def test_what_another_vehicle_had_before_is_not_restored_on_this_one() -> None:
-    switch = SourceSwitch(1)
-    switch.set_target(m.PositionSource(t_ns=0, vision=True, receiver=0), ("gps_input",))
+    switch = switch_to_vision()
     list(switch.requests(1, 0))
     for name, value in BEFORE.items():
         switch.on_message(mavlink.MAVLink_param_value_message(name.encode(), value, 2, 2, 0))
@@ -191,37 +192,30 @@ def test_an_unwritable_disk_does_not_keep_a_spoofed_vehicle_on_its_receiver(tmp_
 
 
 def test_a_source_set_is_requested_until_the_autopilot_confirms_it(tmp_path: Path) -> None:
-    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
-    edge = MavlinkEdge(LinkSection(outputs=["odometry"]), wire, lambda: 0, previous_source=PreviousSourceFile(tmp_path))
-    wire.arrive(packed(heartbeat(), autopilot))
-    list(edge.poll(0))
-    edge.on_message(m.PositionSource(t_ns=0, vision=True, receiver=0))
+    link = WiredEdge(outputs=["odometry"], previous_source=PreviousSourceFile(tmp_path))
+    link.receives(0, heartbeat())
+    link.edge.on_message(m.PositionSource(t_ns=0, vision=True, receiver=0))
 
     def requested(second: int) -> list[float]:
-        wire.arrive(packed(heartbeat(), autopilot))
-        list(edge.poll(second * S))
+        link.receives(second * S, heartbeat())
         command = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
-        return [x.param1 for x in wire.take("COMMAND_LONG") if x.command == command]
+        return [x.param1 for x in link.wire.take("COMMAND_LONG") if x.command == command]
 
     assert [requested(1), requested(2)] == [[2.0], [2.0]]
-    confirmed = packed(mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 0), autopilot)
-    wire.arrive(confirmed)
-    list(edge.poll(2 * S + 1))
+    confirmed = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 0)
+    link.receives(2 * S + 1, confirmed)
     assert [requested(3), requested(4)] == [[], []]
     assert PreviousSourceFile(tmp_path).load() == PreviousSource(7, source_set=1)
-    edge.on_message(m.PositionSource(t_ns=0, vision=False, receiver=0))
+    link.edge.on_message(m.PositionSource(t_ns=0, vision=False, receiver=0))
     assert [requested(second)[:1] for second in range(5, 11)] == [[1.0]] * 6  # without an answer, without a limit
-    wire.arrive(packed(heartbeat(), autopilot))
-    (status,) = [x for x in edge.poll(11 * S) if isinstance(x, m.LinkStatus)]
-    assert "did not switch" in status.detail
-    wire.arrive(confirmed)
-    list(edge.poll(12 * S))
+    link.receives(11 * S, heartbeat())
+    assert "did not switch" in link.status().detail
+    link.receives(12 * S, confirmed)
     assert not (tmp_path / FILE_NAME).exists()
 
 
 def test_the_switch_to_an_autopilot_that_does_not_answer_is_given_up_and_reported() -> None:
-    switch = SourceSwitch(1)
-    switch.set_target(m.PositionSource(t_ns=0, vision=True, receiver=0), ("gps_input",))
+    switch = switch_to_vision()
     asked = [len(list(switch.requests(1, second * S))) for second in range(8)]
     assert asked == [2, 2, 2, 2, 2, 0, 0, 0]
     assert "did not switch" in switch.problem

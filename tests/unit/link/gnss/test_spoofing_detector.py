@@ -3,17 +3,14 @@
 import math
 from typing import Any
 
-import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gnss_rig import accurate, feed_receiver, reading
 from link_rig import MS, S, estimate
-from link_wire import MemoryWire, heartbeat, packed
+from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
-from terrafix.core.config import LinkSection
 from terrafix.link.autopilot.gnss_receiver import gnss_reading
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.gnss.monitor import MIN_VISION_NS
 from terrafix.link.node import LinkNode
 from terrafix.messages import GnssState
@@ -34,22 +31,27 @@ def first(published: list[m.Message], state: GnssState) -> float:
     return next(t for t, s in verdicts(published) if s is state)
 
 
+@pytest.fixture
+def node() -> LinkNode:
+    """A link that trusts its receiver after 20 s."""
+    node = LinkNode(10.0)
+    feed_receiver(node, 20.0, accurate)
+    return node
+
+
 def test_a_receiver_that_agrees_for_ten_seconds_is_trusted() -> None:
     published = feed_receiver(LinkNode(10.0), 20.0, accurate)
     assert first(published, GnssState.TRUSTED) == pytest.approx(10.0, abs=1.0)
     assert not [x for x in published if isinstance(x, m.StatusText) and "GPS" in x.text]
 
 
-def test_jamming_and_silence_are_detected_within_two_seconds() -> None:
-    node = LinkNode(10.0)
-    feed_receiver(node, 20.0, accurate)
+def test_jamming_is_detected_within_half_a_second(node: LinkNode) -> None:
     jammed = feed_receiver(node, 5.0, lambda _: None, begin_s=20.0)
     assert first(jammed, GnssState.LOST) - 20.0 < 0.5
-    silent = LinkNode(10.0)
-    feed_receiver(silent, 20.0, accurate)
-    published: list[m.Message] = []
-    for step in range(1000, 1200):
-        published += silent.tick(step * 20 * MS)
+
+
+def test_silence_is_detected_within_two_seconds(node: LinkNode) -> None:
+    published = [x for step in range(1000, 1200) for x in node.tick(step * 20 * MS)]
     assert first(published, GnssState.LOST) - 20.0 < 2.0
 
 
@@ -61,9 +63,7 @@ def test_a_receiver_that_claims_a_bad_accuracy_is_lost() -> None:
 
 
 @pytest.mark.parametrize("error_m", [(60.0, 0.0), (0.0, -300.0), (2000.0, 2000.0)])
-def test_a_sudden_spoofing_is_detected_within_a_second(error_m: tuple[float, float]) -> None:
-    node = LinkNode(10.0)
-    feed_receiver(node, 20.0, accurate)
+def test_a_sudden_spoofing_is_detected_within_a_second(node: LinkNode, error_m: tuple[float, float]) -> None:
     published = feed_receiver(node, 5.0, lambda _: error_m, begin_s=20.0)
     assert first(published, GnssState.SPOOFED) - 20.0 <= 1.0
     (text,) = [x for x in published if isinstance(x, m.StatusText) and "off the map" in x.text]
@@ -72,10 +72,8 @@ def test_a_sudden_spoofing_is_detected_within_a_second(error_m: tuple[float, flo
 
 
 @pytest.mark.parametrize("bearing_deg", range(0, 360, 45))
-def test_a_drag_off_of_1_mps_is_detected_before_30_m(bearing_deg: int) -> None:
+def test_a_drag_off_of_1_mps_is_detected_before_30_m(node: LinkNode, bearing_deg: int) -> None:
     east, north = math.sin(math.radians(bearing_deg)), math.cos(math.radians(bearing_deg))
-    node = LinkNode(10.0)
-    feed_receiver(node, 20.0, accurate, sigma_m=4.0)
     published = feed_receiver(node, 40.0, lambda t: ((t - 20) * east, (t - 20) * north), begin_s=20.0, sigma_m=4.0)
     assert first(published, GnssState.SPOOFED) - 20.0 < 30.0
 
@@ -86,9 +84,7 @@ def test_with_an_uncertain_estimate_no_receiver_is_called_spoofed() -> None:
     assert GnssState.SPOOFED not in [s for _, s in verdicts(published)]
 
 
-def test_a_spoofed_receiver_is_trusted_again_after_a_minute_of_uninterrupted_agreement() -> None:
-    node = LinkNode(10.0)
-    feed_receiver(node, 20.0, accurate)
+def test_a_spoofed_receiver_is_trusted_again_after_a_minute_of_uninterrupted_agreement(node: LinkNode) -> None:
     feed_receiver(node, 10.0, lambda _: (200.0, 0.0), begin_s=20.0)
     interrupted = feed_receiver(node, 60.0, lambda t: (0.0, 0.0) if t < 85.0 else (25.0, 0.0), begin_s=30.0)
     assert verdicts(interrupted)[-1][1] is GnssState.SPOOFED  # 55 s of agreement, then an error
@@ -97,17 +93,13 @@ def test_a_spoofed_receiver_is_trusted_again_after_a_minute_of_uninterrupted_agr
     assert "Terrafix: GPS 1 agrees with the map again" in [x.text for x in back if isinstance(x, m.StatusText)]
 
 
-def test_a_spoofed_receiver_stays_spoofed_while_it_is_jammed() -> None:
-    node = LinkNode(10.0)
-    feed_receiver(node, 20.0, accurate)
+def test_a_spoofed_receiver_stays_spoofed_while_it_is_jammed(node: LinkNode) -> None:
     feed_receiver(node, 5.0, lambda _: (200.0, 0.0), begin_s=20.0)
     jammed = feed_receiver(node, 5.0, lambda _: None, begin_s=25.0)
     assert {s for _, s in verdicts(jammed)} == {GnssState.SPOOFED}
 
 
-def test_after_a_step_of_the_estimate_a_disagreement_is_disputed() -> None:
-    node = LinkNode(10.0)
-    feed_receiver(node, 20.0, accurate, sigma_m=4.0)
+def test_after_a_step_of_the_estimate_a_disagreement_is_disputed(node: LinkNode) -> None:
     stepped = feed_receiver(node, 9.0, accurate, begin_s=20.0, sigma_m=4.0, ours=lambda _: 27.0)
     assert GnssState.DISPUTED in [s for _, s in verdicts(stepped)]
     assert GnssState.SPOOFED not in [s for _, s in verdicts(stepped)]
@@ -206,11 +198,9 @@ def test_gnss_readings_are_converted_to_si_units_and_unknown_fields_are_none() -
     ("changes", "receivers"), [({}, [1]), ({"gps_id": 1}, [0]), ({"outputs": ["odometry"]}, [0, 1])]
 )
 def test_our_own_gps_input_is_not_read_as_a_receiver(changes: dict[str, Any], receivers: list[int]) -> None:
-    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
-    edge = MavlinkEdge(msgspec.convert(changes, LinkSection), wire, lambda: 0)
     second = mavlink.MAVLink_gps2_raw_message(1, 3, 1, 2, 3, 4, 5, 6, 7, 8, 0, 0)
-    wire.arrive(*(packed(message, autopilot) for message in (heartbeat(), gps_raw(), second)))
-    assert [x.receiver for x in edge.poll(0) if isinstance(x, m.GnssReading)] == receivers
+    published = WiredEdge(**changes).receives(0, heartbeat(), gps_raw(), second)
+    assert [x.receiver for x in published if isinstance(x, m.GnssReading)] == receivers
 
 
 # --- flights without images ---

@@ -8,44 +8,30 @@ from typing import Any, ClassVar
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from link_port import Speaker, kinds
 from link_rig import estimate
-from link_wire import MemoryWire, heartbeat, packed
+from link_wire import WiredEdge, attitude, heartbeat, station_heartbeat
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import ConfigError, LinkError
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.node import LinkNode
 from terrafix_tools.preflight.ground import check_lines
 
 S = 1_000_000_000
-AUTOPILOT = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 GHOST_SYSID = 201
-GCS = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3)
+GCS = station_heartbeat()
+PLACE = (480_000_000, 110_000_000)
+HINT = mavlink.MAVLink_command_int_message(
+    1, 197, 0, mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE, 0, 0, 0, 0, 400, 0, *PLACE, 0
+)
 
 
-class Station:
+class Station(Speaker):
     """A ground station on a UDP port."""
 
     def __init__(self) -> None:
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.socket.settimeout(0.05)
-        self.device = f"udpout:127.0.0.1:{self.socket.getsockname()[1]}"
-        self.mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
-        self._link: Any = None
-
-    def received(self) -> list[Any]:
-        found, decoder = [], mavlink.MAVLink(None)
-        while True:
-            try:
-                data, self._link = self.socket.recvfrom(4096)
-            except TimeoutError:
-                return found
-            found.append(decoder.decode(bytearray(data)))
-
-    def send(self, *messages: Any) -> None:
-        for message in messages:
-            self.socket.sendto(message.pack(self.mav), self._link)
+        super().__init__(255, 190)
+        self.device = f"udpout:127.0.0.1:{self.address[1]}"
 
 
 @pytest.fixture(autouse=True)
@@ -57,45 +43,31 @@ def closed() -> Iterator[None]:
 
 @pytest.fixture
 def station() -> Iterator[Station]:
-    made = Station()
-    yield made
-    made.socket.close()
+    with Station() as station:
+        yield station
 
 
-class Rig:
+class Rig(WiredEdge):
     """The edge with the autopilot on a wire in memory, and ground stations on real ports."""
 
     open: ClassVar[list["Rig"]] = []
 
     def __init__(self, *devices: str, **changes: Any) -> None:
         self.open.append(self)
-        self.wire = MemoryWire()
-        self.edge = MavlinkEdge(LinkSection(ground_devices=list(devices), **changes), self.wire, lambda: 0)
+        super().__init__(ground_devices=list(devices), **changes)
         self.node = LinkNode(10.0)
         self.now_ns = S
-        self.published: list[m.Message] = []
 
     def run(self, seconds: float, *from_autopilot: Any) -> list[m.Message]:
         published: list[m.Message] = []
-        for message in from_autopilot:
-            self.wire.arrive(packed(message, AUTOPILOT))
-        for _ in range(round(seconds * 50)):
+        for step in range(round(seconds * 50)):
             self.now_ns += S // 50
-            published += self.edge.poll(self.now_ns)
+            published += self.receives(self.now_ns, *(from_autopilot if step == 0 else ()), sysid=1)
             if self.now_ns % (S // 5) == 0:
                 list(self.node.on(estimate(self.now_ns, late_ns=0)))
             for message in self.node.tick(self.now_ns):
                 self.edge.on_message(message)
-        self.published += published
         return published
-
-    def status(self) -> m.LinkStatus:
-        """The newest LinkStatus."""
-        return [x for x in self.published if isinstance(x, m.LinkStatus)][-1]
-
-
-def kinds(messages: list[Any]) -> set[str]:
-    return {x.get_type() for x in messages}
 
 
 def test_a_ground_link_gets_texts_values_and_heartbeats_and_the_autopilot_all_messages(station: Station) -> None:
@@ -112,8 +84,7 @@ def test_an_autopilot_on_a_ground_link_is_neither_served_nor_forwarded(station: 
     rig.run(1.2)
     station.received()
     station.mav.srcSystem, station.mav.srcComponent = 1, 1  # a router that forwards packets of the autopilot
-    attitude = mavlink.MAVLink_attitude_message(1000, 0.1, 0.2, 1.0, 0, 0, 0)
-    station.send(heartbeat(), attitude)
+    station.send(heartbeat(), attitude(1000))
     published = rig.run(1.0)
     assert not [x for x in published if isinstance(x, m.VehicleState)]
     status = rig.status()
@@ -122,33 +93,16 @@ def test_an_autopilot_on_a_ground_link_is_neither_served_nor_forwarded(station: 
     assert kinds(rig.wire.take()) & {"ATTITUDE"} == set()
 
 
-def test_a_hint_on_a_ground_link_is_accepted_and_acknowledged_there(station: Station) -> None:
-    rig = Rig(station.device)
-    rig.run(1.2)
-    station.received()
-    command = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
-    place = (480_000_000, 110_000_000)
-    station.send(GCS, mavlink.MAVLink_command_int_message(1, 197, 0, command, 0, 0, 0, 0, 400, 0, *place, 0))
-    time.sleep(0.02)
-    hints = [x for x in rig.run(0.1) if isinstance(x, m.PositionHint)]
-    assert len(hints) == 1
-    assert [x.result for x in station.received() if x.get_type() == "COMMAND_ACK"] == [mavlink.MAV_RESULT_ACCEPTED]
-    assert "COMMAND_ACK" not in kinds(rig.wire.take())
-
-
 def test_a_hint_on_two_links_counts_once_and_is_acknowledged_on_both(station: Station) -> None:
     rig = Rig(station.device)
     rig.run(1.2)
     station.received()
-    command = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
-    place = (480_000_000, 110_000_000)
-    hint = mavlink.MAVLink_command_int_message(1, 197, 0, command, 0, 0, 0, 0, 400, 0, *place, 0)
-    station.send(GCS, hint)
-    rig.wire.arrive(packed(hint, mavlink.MAVLink(None, srcSystem=255, srcComponent=190)))
+    station.send(GCS, HINT)
     time.sleep(0.02)
-    assert len([x for x in rig.run(0.1) if isinstance(x, m.PositionHint)]) == 1
-    assert len(rig.wire.take("COMMAND_ACK")) == 1
-    assert len([x for x in station.received() if x.get_type() == "COMMAND_ACK"]) == 1
+    published = [*rig.receives(rig.now_ns, GCS, HINT, sysid=255, compid=190), *rig.run(0.1)]
+    assert len([x for x in published if isinstance(x, m.PositionHint)]) == 1
+    acks = (rig.wire.take("COMMAND_ACK"), station.received("COMMAND_ACK"))
+    assert [[ack.result for ack in link] for link in acks] == [[mavlink.MAV_RESULT_ACCEPTED]] * 2
 
 
 def test_a_lost_ground_link_does_not_affect_the_others_and_is_opened_again(station: Station) -> None:
@@ -216,7 +170,6 @@ def test_the_ghost_vehicle_is_sent_to_the_ground_and_not_to_the_autopilot(statio
 
 def test_without_a_fix_the_ghost_vehicle_has_no_position(station: Station) -> None:
     rig = Rig(station.device, view_sysid=GHOST_SYSID)
-    rig.node = LinkNode(10.0)
     rig.node.on = lambda _message: []  # type: ignore[method-assign]
     rig.run(2.0, heartbeat())
     ghost_messages = from_ghost(station.received())
@@ -230,7 +183,7 @@ def test_the_ghost_vehicle_rejects_commands_and_an_origin_set_on_it_is_a_hint(st
     rig.run(1.2)
     station.received()
     arm = mavlink.MAVLink_command_long_message(GHOST_SYSID, 1, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, *(0.0,) * 6)
-    origin = mavlink.MAVLink_set_gps_global_origin_message(GHOST_SYSID, 480_000_000, 110_000_000, 0)
+    origin = mavlink.MAVLink_set_gps_global_origin_message(GHOST_SYSID, *PLACE, 0)
     station.send(GCS, arm, origin)
     time.sleep(0.02)
     assert len([x for x in rig.run(0.1) if isinstance(x, m.PositionHint)]) == 1
@@ -243,7 +196,7 @@ def test_the_ghost_vehicle_rejects_commands_and_an_origin_set_on_it_is_a_hint(st
 def test_a_ghost_vehicle_that_a_router_sends_back_is_not_an_autopilot(station: Station) -> None:
     rig = Rig(station.device, view_sysid=GHOST_SYSID)
     beat = mavlink.MAVLink_heartbeat_message(1, mavlink.MAV_AUTOPILOT_GENERIC, 0, 0, 4, 3)
-    rig.wire.arrive(packed(beat, mavlink.MAVLink(None, srcSystem=GHOST_SYSID, srcComponent=1)))
+    rig.receives(rig.now_ns, beat, sysid=GHOST_SYSID)
     rig.run(0.5)
     assert not rig.status().connected
 
@@ -265,7 +218,7 @@ def test_an_inconsistent_configuration_of_ground_links_raises(
     changes: dict[str, Any], error: type[Exception], text: str
 ) -> None:
     with pytest.raises(error, match=text):
-        MavlinkEdge(LinkSection(**changes), MemoryWire(), lambda: 0)
+        WiredEdge(**changes)
 
 
 def test_preflight_checks_the_ground_links(station: Station) -> None:

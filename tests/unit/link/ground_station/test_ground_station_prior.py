@@ -8,20 +8,18 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from link_rig import S, covariance, estimate, every, fly, texts
-from link_wire import MemoryWire, attitude, heartbeat, packed
+from link_wire import WiredEdge, armed, attitude, heartbeat, station_heartbeat
 from terrafix import messages as m
-from terrafix.core.config import LinkSection
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.ground_station.position_prior import DEFAULT_RADIUS_M, MIN_RADIUS_M
 from terrafix.link.ground_station.prior_request import HOLD_OFF_NS, REPEAT_NS, UNKNOWN_POSITION_SIGMA_M, PriorRequest
 from terrafix.link.node import LinkNode
 
 LAT, LON = 48.1234567, 11.7654321
 E7 = (round(LAT * 1e7), round(LON * 1e7))
-STATION = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+STATION = (255, 190)
 OURS = (1, 197)
-GCS = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3)
+GCS = station_heartbeat()
 SET_ORIGIN = mavlink.MAVLink_set_gps_global_origin_message(1, *E7, 0)
 
 
@@ -30,20 +28,20 @@ class LinkSide:
 
     def __init__(self, *, station: bool = True) -> None:
         """``station``: the sender has sent the heartbeat of a ground station."""
-        self.wire = MemoryWire()
-        self.edge = MavlinkEdge(LinkSection(), self.wire, lambda: 0)
-        self.now_ns = S
+        self._link = WiredEdge()
+        self.wire, self.now_ns = self._link.wire, S
         if station:
             self.receives(GCS)
 
-    def receives(self, *messages: Any, sender: mavlink.MAVLink = STATION) -> list[m.PositionHint]:
+    def receives(self, *messages: Any, sender: tuple[int, int] = STATION) -> list[m.PositionHint]:
+        """``sender``: system and component."""
         self.now_ns += S // 10
-        self.wire.arrive(*(packed(x, sender) for x in messages))
-        return [x for x in self.edge.poll(self.now_ns) if isinstance(x, m.PositionHint)]
+        published = self._link.receives(self.now_ns, *messages, sysid=sender[0], compid=sender[1])
+        return [x for x in published if isinstance(x, m.PositionHint)]
 
     def replies(self) -> list[tuple[int, int]]:
         """(command, result) of every COMMAND_ACK to the ground station."""
-        acks = [x for x in self.wire.take("COMMAND_ACK")]
+        acks = self.wire.take("COMMAND_ACK")
         assert all((x.target_system, x.target_component) == (255, 190) for x in acks)
         return [(x.command, x.result) for x in acks]
 
@@ -118,8 +116,7 @@ def test_an_origin_set_by_a_ground_station_is_a_hint() -> None:
 def test_an_origin_set_by_a_companion_or_for_another_vehicle_is_not_a_hint() -> None:
     side = LinkSide(station=False)
     assert side.receives(SET_ORIGIN) == []  # no heartbeat of a ground station before
-    companion = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
-    assert side.receives(GCS) == [] and side.receives(SET_ORIGIN, sender=companion) == []
+    assert side.receives(GCS) == [] and side.receives(SET_ORIGIN, sender=(1, 191)) == []
     assert side.receives(mavlink.MAVLink_set_gps_global_origin_message(2, *E7, 0)) == []
 
 
@@ -131,7 +128,7 @@ def test_a_hint_from_a_sender_that_is_not_a_ground_station_is_denied() -> None:
 
 def test_an_origin_addressed_to_the_autopilot_s_system_id_is_a_hint() -> None:
     side = LinkSide()
-    side.receives(heartbeat(), sender=mavlink.MAVLink(None, srcSystem=7, srcComponent=1))
+    side.receives(heartbeat(), sender=(7, 1))
     assert len(side.receives(GCS, mavlink.MAVLink_set_gps_global_origin_message(7, *E7, 0))) == 1
 
 
@@ -262,31 +259,27 @@ def position(boot_ms: int, lat_deg: float, lon_deg: float, above_m: float = 100.
 class Restarted:
     """Edge and node that start while the autopilot is in the air, with its position at LAT, LON."""
 
-    def __init__(self, *, armed: bool = True) -> None:
-        self.wire, self.node = MemoryWire(), LinkNode(10.0)
-        self.edge = MavlinkEdge(LinkSection(), self.wire, lambda: 0)
-        self._autopilot = mavlink.MAVLink(None, 1, 1)
-        self._beat = heartbeat()
-        self._beat.base_mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
-        self.seconds = 0
+    def __init__(self, *, flies: bool = True) -> None:
+        self._link, self._node = WiredEdge(), LinkNode(10.0)
+        self._beat = armed() if flies else heartbeat()
+        self._seconds = 0
 
     def hints(self, seconds: int, *, anchor_age_ms: int | None = -1, above_m: float = 100.0) -> list[m.PositionHint]:
         """-> hints in the next ``seconds``. ``anchor_age_ms``: of estimates every half second; None: no estimates."""
         found: list[m.PositionHint] = []
-        for step in range(self.seconds * 50, (self.seconds + seconds) * 50):
-            now_ns = step * S // 50
+        for step in range(self._seconds * 50, (self._seconds + seconds) * 50):
+            now_ns, telemetry = step * S // 50, list[Any]()
             if step % 25 == 0:
                 boot_ms = now_ns // 10**6
-                published = (self._beat, attitude(boot_ms), position(boot_ms, LAT, LON, above_m))
-                self.wire.arrive(*(packed(x, self._autopilot) for x in published))
+                telemetry = [self._beat, attitude(boot_ms), position(boot_ms, LAT, LON, above_m)]
                 if anchor_age_ms is not None:
-                    list(self.node.on(estimate(now_ns, late_ns=0, anchor_age_ms=anchor_age_ms)))
-            for message in self.edge.poll(now_ns):
-                list(self.node.on(message))
+                    list(self._node.on(estimate(now_ns, late_ns=0, anchor_age_ms=anchor_age_ms)))
+            for message in self._link.receives(now_ns, *telemetry, sysid=1):
+                list(self._node.on(message))
                 found += [message] if isinstance(message, m.PositionHint) else []
-            for message in self.node.tick(now_ns):
-                self.edge.on_message(message)
-        self.seconds += seconds
+            for message in self._node.tick(now_ns):
+                self._link.edge.on_message(message)
+        self._seconds += seconds
         return found
 
 
@@ -301,5 +294,5 @@ def test_after_a_restart_in_flight_the_position_of_the_autopilot_is_a_hint() -> 
 
 def test_no_hint_from_the_autopilot_with_a_map_fix_or_disarmed_or_near_the_ground() -> None:
     assert Restarted().hints(10, anchor_age_ms=0) == []  # only the link was restarted
-    assert Restarted(armed=False).hints(10) == []
+    assert Restarted(flies=False).hints(10) == []
     assert Restarted().hints(10, above_m=5.0) == []

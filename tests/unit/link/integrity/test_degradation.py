@@ -6,13 +6,10 @@ import re
 
 import msgspec
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from link_rig import MS, S, estimate, every, fly, gps, texts
-from link_wire import MemoryWire, heartbeat, packed
+from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
-from terrafix.core.config import LinkSection
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.node import LinkNode
 from terrafix.link.pilot_text.debounce import MAX_INTERVAL_NS, RESET_AFTER_NS, Debounce
 
@@ -147,23 +144,20 @@ def test_the_end_of_a_warning_is_reported_after_five_seconds() -> None:
 
 
 def test_named_values_are_sent_once_a_second_after_an_autopilot_is_connected() -> None:
-    wire = MemoryWire()
-    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
+    link = WiredEdge()
     (sent,) = gps(list(LinkNode(10.0).tick(0)))
     known = msgspec.structs.replace(sent, fix_type=3, horiz_accuracy_m=6.5, degradation=1, unanchored_s=7.25)
     for tenth in range(20):
-        edge.on_message(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
-    assert wire.take("NAMED_VALUE_FLOAT") == []
-    wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)))
-    list(edge.poll(0))
+        link.edge.on_message(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
+    assert link.wire.take("NAMED_VALUE_FLOAT") == []
+    link.receives(0, heartbeat())
     for tenth in range(25):
-        edge.on_message(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
-    values = [(x.name, x.value) for x in wire.take("NAMED_VALUE_FLOAT")]
+        link.edge.on_message(msgspec.structs.replace(known, t_ns=tenth * 100 * MS))
+    values = [(x.name, x.value) for x in link.wire.take("NAMED_VALUE_FLOAT")]
     assert values == [("TFX_FIX", 3.0), ("TFX_ACC_M", 6.5), ("TFX_MAP_S", 7.25), ("TFX_CAUT", 1.0)] * 2
-    wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)))
-    list(edge.poll(4 * S))
-    edge.on_message(msgspec.structs.replace(sent, t_ns=5 * S))
-    lost = {x.name: x.value for x in wire.take("NAMED_VALUE_FLOAT")}
+    link.receives(4 * S, heartbeat())
+    link.edge.on_message(msgspec.structs.replace(sent, t_ns=5 * S))
+    lost = {x.name: x.value for x in link.wire.take("NAMED_VALUE_FLOAT")}
     assert lost["TFX_FIX"] == 1.0
     assert math.isnan(lost["TFX_ACC_M"]) and math.isnan(lost["TFX_MAP_S"])
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from link_rig import covariance
+from link_rig import covariance, estimate
 from terrafix import messages as m
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
 from terrafix.link.integrity.output_predictor import (
@@ -78,23 +78,10 @@ def recorded(
 def predicted(age_s: float, inertial: InertialBuffer, *, heading_sigma_rad: float = 0.01) -> PredictedState:
     cov = list(covariance(3.0))
     cov[35] = heading_sigma_rad**2
-    estimate = m.NavEstimate(
-        t_ns=S,
-        frame_id=1,
-        lat_deg=LAT,
-        lon_deg=LON,
-        alt_amsl_m=AMSL,
-        agl_m=100.0,
-        velocity_enu_mps=(SPEED_MPS, 0.0, 0.0),
-        velocity_sigma_mps=0.2,
-        q_w_b=quat_from_rot(rot_w_b(YAW_RAD, *attitude(0.0))),
-        cov=tuple(cov),
-        source_label=m.SourceLabel.SATELLITE_ANCHORED,
-        covariance_mode=m.CovarianceMode.MARGINALS,
-        last_anchor_age_ms=0,
-        emitted_at_ns=S,
-    )
-    return predict_to(estimate, S + round(age_s * S), inertial)
+    place = {"lat_deg": LAT, "lon_deg": LON, "alt_amsl_m": AMSL, "velocity_enu_mps": (SPEED_MPS, 0.0, 0.0)}
+    attitude_w_b = quat_from_rot(rot_w_b(YAW_RAD, *attitude(0.0)))
+    current = estimate(S, velocity_sigma=0.2, late_ns=0, cov=tuple(cov), q_w_b=attitude_w_b, **place)
+    return predict_to(current, S + round(age_s * S), inertial)
 
 
 def speed_error_mps(state: PredictedState, age_s: float) -> float:

@@ -3,10 +3,8 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_wire import MemoryWire, heartbeat, packed
+from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
-from terrafix.core.config import LinkSection
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.mavlink.diagnosis import ReceivedTraffic, no_autopilot_reason
 from terrafix.link.mavlink.message_rates import MAX_QUICK_REQUESTS, OPTIONAL_ON_PX4, Streams, streams_of_firmware
 
@@ -106,34 +104,13 @@ def test_px4_without_a_receiver_or_a_position_reports_no_problem() -> None:
 # --- autopilots on the link ---
 
 
-def edge_on(wire: MemoryWire, **changes: int) -> MavlinkEdge:
-    return MavlinkEdge(LinkSection(**changes), wire, lambda: 0)  # type: ignore[arg-type]
-
-
-def status_of(edge: MavlinkEdge, now_ns: int) -> m.LinkStatus:
-    (status,) = [x for x in edge.poll(now_ns) if isinstance(x, m.LinkStatus)]
-    return status
-
-
 def test_two_autopilots_are_reported_and_the_confirmed_one_is_served() -> None:
-    wire = MemoryWire()
-    edge = edge_on(wire)
-    edge.on_message(m.CameraVehicle(t_ns=0, sysid=7))
-    wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)), packed(heartbeat(), mavlink.MAVLink(None, 9, 1)))
-    status = status_of(edge, 0)
-    assert status.sysid == 7
-    assert "more than one autopilot: 7 is served, 9 is not" in status.detail
-
-
-def test_the_autopilot_named_in_the_configuration_is_served() -> None:
-    wire = MemoryWire()
-    edge = edge_on(wire, autopilot_sysid=9)
-    wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 7, 1)))
-    status = status_of(edge, 0)
-    assert not status.connected
-    assert "has system id 7, not 9" in status.detail
-    wire.arrive(packed(heartbeat(), mavlink.MAVLink(None, 9, 1)))
-    assert status_of(edge, S).sysid == 9
+    link = WiredEdge()
+    link.edge.on_message(m.CameraVehicle(t_ns=0, sysid=7))
+    link.receives(0, heartbeat())
+    link.receives(S, heartbeat(), sysid=9)
+    assert link.status().sysid == 7
+    assert "more than one autopilot: 7 is served, 9 is not" in link.status().detail
 
 
 GCS = {(255, 190): mavlink.MAV_AUTOPILOT_INVALID}

@@ -8,11 +8,10 @@ import time
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_rig import MS, TICK_NS, S, estimate, fly
-from link_wire import MemoryWire, attitude, heartbeat, packed, states
-from terrafix import messages as m
+from link_rig import MS, TICK_NS, S, estimate
+from link_wire import WiredEdge, attitude, heartbeat, packed, states
 from terrafix.core.config import LinkSection
-from terrafix.link.edge import MavlinkEdge, open_edge
+from terrafix.link.edge import open_edge
 from terrafix.link.mavlink.bandwidth import MIN_RATE_HZ, USABLE_SHARE_IN, LinkBandwidth
 from terrafix.link.mavlink.message_rates import STREAMS_HZ
 from terrafix.link.mavlink.timesync import TimeSync
@@ -104,17 +103,15 @@ def test_requested_and_sent_messages_fit_the_baud_rate_over_a_pty(baud: int, slo
 
 
 def test_a_saturated_line_is_reported_once_a_second() -> None:
-    wire = MemoryWire()
-    edge = MavlinkEdge(LinkSection(device="/dev/ttyTHS1", baud=57_600), wire, lambda: 0)
-    autopilot = mavlink.MAVLink(None, 7, 1)
+    link = WiredEdge(device="/dev/ttyTHS1", baud=57_600)
 
     def second(number: int, packets: int) -> str:
-        wire.arrive(packed(heartbeat(), autopilot), *(packed(attitude(i), autopilot) for i in range(packets)))
-        return [x for x in edge.poll(number * S) if isinstance(x, m.LinkStatus)][-1].detail
+        link.receives(number * S, heartbeat(), *(attitude(i) for i in range(packets)))
+        return link.status().detail
 
     second(0, 0)
     assert "the line is full" not in second(1, 60)
-    size = len(packed(attitude(255), autopilot))
+    size = len(packed(attitude(255), mavlink.MAVLink(None)))
     assert "the line is full (in 9" in second(2, 5700 // size)  # of 5760 bytes
     assert "the line is full" not in second(3, 20)
 
@@ -158,40 +155,26 @@ def test_duplicate_and_late_timesync_responses_are_ignored() -> None:
     assert sync.offset_at_ns(S) == pytest.approx(9 * S, abs=2 * MS)
 
 
-def synced_edge(offset_ns: int) -> tuple[MavlinkEdge, MemoryWire, mavlink.MAVLink]:
+def synced_edge(offset_ns: int) -> WiredEdge:
     """-> an edge after 20 s of round trips with an autopilot whose clock is ``offset_ns`` ahead."""
-    wire, autopilot = MemoryWire(), mavlink.MAVLink(None, 7, 1)
-    edge = MavlinkEdge(LinkSection(), wire, lambda: 0)
+    link = WiredEdge()
     for tenth in range(200):
         now_ns = tenth * 100 * MS
-        if tenth % 10 == 0:
-            wire.arrive(packed(heartbeat(), autopilot))
-        list(edge.poll(now_ns))
-        for request in wire.take("TIMESYNC"):
-            wire.arrive(packed(mavlink.MAVLink_timesync_message(request.ts1 + MS + offset_ns, request.ts1), autopilot))
-        list(edge.poll(now_ns + 2 * MS))
-    return edge, wire, autopilot
+        link.receives(now_ns, *([heartbeat()] if tenth % 10 == 0 else []))
+        times = [request.ts1 for request in link.wire.take("TIMESYNC")]
+        link.receives(now_ns + 2 * MS, *(mavlink.MAVLink_timesync_message(t + MS + offset_ns, t) for t in times))
+    return link
 
 
 @pytest.mark.parametrize("days", [1, 49.7, 50, 120])
 def test_measurement_times_are_correct_when_the_boot_time_wraps(days: float) -> None:
     """time_boot_ms has 32 bits, 49.7 days; TIMESYNC has 64."""
     offset_ns = round(days * 86_400) * S
-    edge, wire, autopilot = synced_edge(offset_ns)
     boot_ms = (20_000 + offset_ns // MS) % 2**32  # measured at local time 20.000 s, arrives 30 ms later
-    wire.arrive(packed(heartbeat(), autopilot), packed(attitude(boot_ms), autopilot))
-    (state,) = states(edge.poll(20_030 * MS))
+    (state,) = states(synced_edge(offset_ns).receives(20_030 * MS, heartbeat(), attitude(boot_ms)))
     assert state.t_ns == pytest.approx(20 * S, abs=2 * MS)
 
 
 def test_after_an_autopilot_reboot_measurements_have_their_arrival_time() -> None:
-    edge, wire, autopilot = synced_edge(1000 * S)
-    wire.arrive(packed(heartbeat(), autopilot), packed(attitude(500), autopilot))
-    (state,) = states(edge.poll(21 * S))
+    (state,) = states(synced_edge(1000 * S).receives(21 * S, heartbeat(), attitude(500)))
     assert state.t_ns == 21 * S
-
-
-def test_gps_input_does_not_depend_on_the_autopilots_clock() -> None:
-    """So a reboot of the autopilot does not affect it."""
-    published = fly(LinkNode(10.0), 0, 10 * S, lambda now: [estimate(now - 100 * MS)] if now % (400 * MS) == 0 else [])
-    assert sum(isinstance(x, m.GpsInput) for x in published) == 100

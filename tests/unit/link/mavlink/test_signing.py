@@ -9,13 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from link_wire import MemoryWire, attitude, heartbeat, packed, states
-from terrafix.core.config import LinkSection
+from link_wire import WiredEdge, attitude, heartbeat, packed, states
 from terrafix.core.errors import ConfigError
-from terrafix.link.edge import MavlinkEdge
 from terrafix.link.mavlink.framing import Framer
 from terrafix.link.mavlink.signing import EPOCH_UNIX_NS, Signing, read_key, timestamp
-from terrafix.messages import LinkStatus
 
 KEY = bytes(range(32))
 S = 1_000_000_000
@@ -43,18 +40,18 @@ def key_file(tmp_path: Path, content: bytes = KEY.hex().encode() + b"\n", mode: 
     return path
 
 
-def edge_on(wire: MemoryWire, key: Path) -> MavlinkEdge:
-    return MavlinkEdge(LinkSection(signing_key=str(key)), wire, lambda: UNIX_NS)
+def edge_with(key: Path) -> WiredEdge:
+    return WiredEdge(unix_ns=UNIX_NS, signing_key=str(key))
 
 
 def test_signed_packets_have_the_published_layout_and_pymavlink_accepts_them(tmp_path: Path) -> None:
-    wire = MemoryWire()
-    list(edge_on(wire, key_file(tmp_path)).poll(0))
+    link = edge_with(key_file(tmp_path))
+    link.poll(0)
     receiver = mavlink.MAVLink(None)
     receiver.signing.secret_key = KEY
     receiver.signing.timestamp = timestamp(UNIX_NS)
     timestamps = []
-    for packet in wire.sent:
+    for packet in link.wire.sent:
         assert receiver.decode(bytearray(packet)).get_signed()
         assert packet[2] == 1
         assert packet[-6:] == hashlib.sha256(KEY + packet[:-6]).digest()[:6]
@@ -119,22 +116,14 @@ def test_a_signed_packet_with_any_changed_byte_is_rejected(place: int, bits: int
 
 
 def test_the_edge_ignores_unsigned_packets_and_reports_them(tmp_path: Path) -> None:
-    wire = MemoryWire()
-    edge = edge_on(wire, key_file(tmp_path))
-    unsigned = mavlink.MAVLink(None, 7, 1)
-    wire.arrive(packed(heartbeat(), unsigned) + packed(attitude(1000), unsigned))
-    published = list(edge.poll(0))
-    assert states(published) == []
-    (status,) = [m for m in published if isinstance(m, LinkStatus)]
-    assert (status.connected, status.refused) == (False, 2)
-    assert "not signed with link.signing_key" in status.detail
-    true = sender()
-    wire.arrive(packed(heartbeat(), true) + packed(attitude(1000), true) + packed(attitude(1040), unsigned))
-    published = list(edge.poll(S))
-    assert len(states(published)) == 1
-    (status,) = [m for m in published if isinstance(m, LinkStatus)]
-    assert status.connected
-    assert "3 unsigned or wrongly signed packets ignored" in status.detail
+    link, true = edge_with(key_file(tmp_path)), sender()
+    assert states(link.receives(0, heartbeat(), attitude(1000))) == []
+    assert (link.status().connected, link.status().refused) == (False, 2)
+    assert "not signed with link.signing_key" in link.status().detail
+    link.wire.arrive(packed(heartbeat(), true) + packed(attitude(1000), true))
+    assert len(states(link.receives(S, attitude(1040)))) == 1
+    assert link.status().connected
+    assert "3 unsigned or wrongly signed packets ignored" in link.status().detail
 
 
 def test_signing_keys_are_read_in_both_formats_and_invalid_ones_raise(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import rasterio.warp
 from rasterio.transform import Affine
 
 import map_rasters
+from map_packages import alter
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
@@ -30,12 +31,15 @@ def mountains() -> np.ndarray:
     return height_m[None]
 
 
+def mountain_dem(folder: Path) -> Path:
+    corner = Affine(5, 0, 299_500, 0, -5, 2_600_500)
+    return map_rasters.write_tif(folder / "d.tif", mountains(), "EPSG:32651", corner, nodata=-32768)
+
+
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(700, 900))
-    corner = Affine(5, 0, 299_500, 0, -5, 2_600_500)
-    dem = map_rasters.write_tif(tmp_path / "d.tif", mountains(), "EPSG:32651", corner, nodata=-32768)
-    return build(tif, tmp_path / "m.gpkg", dem=dem)
+    return build(tif, tmp_path / "m.gpkg", dem=mountain_dem(tmp_path))
 
 
 def test_gdal_reads_the_same_heights(package: Path) -> None:
@@ -109,8 +113,7 @@ def test_heights_are_preserved_by_their_encoding(low: float, span: float) -> Non
 def test_several_processes_write_the_same_heights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(build_module, "TILES_PER_WORKER", 4)
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(700, 900))
-    corner = Affine(5, 0, 299_500, 0, -5, 2_600_500)
-    dem = map_rasters.write_tif(tmp_path / "d.tif", mountains(), "EPSG:32651", corner, nodata=-32768)
+    dem = mountain_dem(tmp_path)
     started: list[int] = []
     executor = pool.ProcessPoolExecutor
     monkeypatch.setattr(pool, "ProcessPoolExecutor", lambda n, *more: (started.append(n), executor(n, *more))[1])
@@ -120,18 +123,14 @@ def test_several_processes_write_the_same_heights(tmp_path: Path, monkeypatch: p
 
 
 def test_an_altered_tile_scale_is_detected(package: Path) -> None:
-    db = sqlite3.connect(package)
-    db.execute("UPDATE gpkg_2d_gridded_tile_ancillary SET offset = offset + 100 WHERE tpudt_id = 1")
-    db.commit()
-    db.close()
+    alter(package, "UPDATE gpkg_2d_gridded_tile_ancillary SET offset = offset + 100 WHERE tpudt_id = 1")
     with pytest.raises(MapError, match="tile of elevation, zoom 0 column 0 row 0 was altered"):
         MapPackage.open(package, verify=True)
 
 
 def test_a_truncated_dem_is_a_one_line_error(tmp_path: Path) -> None:
     tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
-    corner = Affine(5, 0, 299_500, 0, -5, 2_600_500)
-    dem = map_rasters.write_tif(tmp_path / "d.tif", mountains(), "EPSG:32651", corner)
+    dem = mountain_dem(tmp_path)
     dem.write_bytes(dem.read_bytes()[:150_000])
     with pytest.raises(MapError, match=r"d\.tif: elevation cannot be read"):
         build(tif, tmp_path / "m.gpkg", dem=dem)

@@ -1,15 +1,13 @@
 """Descriptors in a package: equal to those computed in flight, in any CRS; integrity; the GeoPackage standard."""
 
 import math
-import sqlite3
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pyproj import Transformer
-from rasterio.transform import Affine
 
 import map_rasters
+from map_packages import alter
 from map_standard import violations
 from terrafix.anchor.matching.descriptor_cache import MapFeatures
 from terrafix.anchor.matching.frame_matcher import FrameMatcher
@@ -28,12 +26,10 @@ SIDE_PX, LAT_DEG, LON_DEG = 800, 68.0, 17.4
 
 def placed(path: Path, crs: str, pixel_m: float = 2.0) -> Path:
     """A generated GeoTIFF around the position, with a hole near its centre."""
-    x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(LON_DEG, LAT_DEG)
-    pixel = pixel_m / math.cos(math.radians(LAT_DEG)) if crs == "EPSG:3857" else pixel_m
-    corner = Affine(pixel, 0, x - SIDE_PX * pixel / 2, 0, -pixel, y + SIDE_PX * pixel / 2)
     bands = np.tile(map_rasters.texture(SIDE_PX // 2, SIDE_PX // 2, seed=4), (1, 2, 2))
     bands[:, 450:490, 380:440] = 0
-    return map_rasters.write_tif(path, bands, crs, corner, nodata=0)
+    pixel = pixel_m / math.cos(math.radians(LAT_DEG)) if crs == "EPSG:3857" else pixel_m
+    return map_rasters.around(path, bands, crs, (LAT_DEG, LON_DEG), pixel, nodata=0)
 
 
 @pytest.fixture(params=["EPSG:32634", "EPSG:32632", "EPSG:3857"])
@@ -72,6 +68,11 @@ def test_a_scale_without_stored_descriptors_is_computed(tmp_path: Path) -> None:
     assert np.abs(ours[0] - theirs[0]).max() < 0.05 and np.abs(ours[0] - theirs[0]).mean() < 1e-4
 
 
+def search_warnings(local: LocalMap) -> list[str]:
+    matcher = FrameMatcher(suitability.DEFAULT_CAMERA, local, GradientDescriber())
+    return list(suitability._search_warnings(local, matcher, 110.0))
+
+
 def test_a_package_without_descriptors_is_valid_and_the_check_reports_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -82,14 +83,10 @@ def test_a_package_without_descriptors_is_valid_and_the_check_reports_it(
     local = package.bind(LocalFrame(LAT_DEG, LON_DEG))
     assert package.layer().descriptors is None and local.descriptors(PooledGradientDescriber.name) is None
     assert CoarseDescriptors(local, PooledGradientDescriber()).gsd_m(2.1) == 2.1
-    (warning,) = suitability._search_warnings(
-        local, FrameMatcher(suitability.DEFAULT_CAMERA, local, GradientDescriber()), 110.0
-    )
+    (warning,) = search_warnings(local)
     assert warning.startswith("no descriptors for a search at 110 m")
     local = MapPackage.open(build(tif, tmp_path / "with.gpkg")).bind(LocalFrame(LAT_DEG, LON_DEG))
-    assert not suitability._search_warnings(
-        local, FrameMatcher(suitability.DEFAULT_CAMERA, local, GradientDescriber()), 110.0
-    )
+    assert not search_warnings(local)
 
 
 def test_descriptors_are_covered_by_checksum_and_hashes(tmp_path: Path) -> None:
@@ -97,10 +94,7 @@ def test_descriptors_are_covered_by_checksum_and_hashes(tmp_path: Path) -> None:
     assert violations(path) == []
     table = MapPackage.open(path).layer().descriptors
     assert table is not None and table.tiles > 15 and table.name == PooledGradientDescriber.name
-    db = sqlite3.connect(path)
-    db.execute(f"UPDATE {table.table} SET tile_data = (SELECT tile_data FROM {table.table} LIMIT 1)")
-    db.commit()
-    db.close()
+    alter(path, f"UPDATE {table.table} SET tile_data = (SELECT tile_data FROM {table.table} LIMIT 1)")
     with pytest.raises(MapError, match="tile of imagery_descriptors"):
         MapPackage.open(path, verify=True)
     package = MapPackage.open(path)

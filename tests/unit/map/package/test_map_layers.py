@@ -1,5 +1,6 @@
 """Several layers of different dates in one package."""
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -22,9 +23,7 @@ LAT_DEG, LON_DEG = 23.4986, 121.0426
 
 def placed(path: Path, seed: int, crs: str, pixel: float, side_px: int) -> Path:
     """A texture around the same WGS84 position."""
-    x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(LON_DEG, LAT_DEG)
-    corner = Affine(pixel, 0, x - side_px * pixel / 2, 0, -pixel, y + side_px * pixel / 2)
-    return map_rasters.write_tif(path, map_rasters.texture(side_px, side_px, seed), crs, corner)
+    return map_rasters.around(path, map_rasters.texture(side_px, side_px, seed), crs, (LAT_DEG, LON_DEG), pixel)
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +40,14 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_package(layers, folder / "m.gpkg")
 
 
-def test_layers_are_ordered_by_date_with_their_metadata(package: Path) -> None:
+@pytest.fixture
+def opened(package: Path) -> Iterator[MapPackage]:
     opened = MapPackage.open(package, verify=True)
+    yield opened
+    opened.close()
+
+
+def test_layers_are_ordered_by_date_with_their_metadata(opened: MapPackage) -> None:
     manifest = opened.manifest
     assert [(x.table, x.date, x.source, x.ce90_m) for x in manifest.layers] == [
         ("imagery", "2023-06-01", "new.tif", 3.0),
@@ -54,11 +59,9 @@ def test_layers_are_ordered_by_date_with_their_metadata(package: Path) -> None:
     assert manifest.layers[0].gsd_m == pytest.approx(np.cos(np.radians(LAT_DEG)), rel=5e-3)
     described = [layer.descriptors.tiles for layer in manifest.layers if layer.descriptors]
     assert manifest.tiles == sum(layer.tiles for layer in manifest.layers) + sum(described)
-    opened.close()
 
 
-def test_a_window_shows_the_requested_layer_at_the_same_position(package: Path) -> None:
-    opened = MapPackage.open(package)
+def test_a_window_shows_the_requested_layer_at_the_same_position(opened: MapPackage) -> None:
     frame = LocalFrame(LAT_DEG, LON_DEG)
     local = opened.bind(frame)
     newest, _ = local.window(-50, 50, 100, 100, 1.0)
@@ -74,17 +77,14 @@ def test_a_window_shows_the_requested_layer_at_the_same_position(package: Path) 
     turned = old.astype(np.float64)  # grid north is within half a degree of true north here
     inner = np.s_[10:90, 10:90]
     assert np.corrcoef(expected[inner].ravel(), turned[inner].ravel())[0, 1] > 0.9
-    opened.close()
 
 
-def test_coverage_is_that_of_the_layer(package: Path) -> None:
-    opened = MapPackage.open(package)
+def test_coverage_is_that_of_the_layer(opened: MapPackage) -> None:
     lat_deg, lon_deg = LocalFrame(LAT_DEG, LON_DEG).to_wgs84(280.0, 0.0)
     assert not opened.covers(lat_deg, lon_deg) and not opened.covers(lat_deg, lon_deg, "imagery_2")
     assert opened.covers(lat_deg, lon_deg, "imagery_3")
     with pytest.raises(MapError, match="has no layer 'spring'; it has imagery, imagery_2, imagery_3"):
         opened.covers(lat_deg, lon_deg, "spring")
-    opened.close()
 
 
 def test_gdal_reads_every_layer_with_its_grid(package: Path) -> None:

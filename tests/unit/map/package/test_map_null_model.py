@@ -1,8 +1,6 @@
 """The null model of a package: fitted to mirrored flights over the same map, covered by the signature."""
 
-import json
 import shutil
-import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +9,11 @@ import pytest
 from typer.testing import CliRunner
 
 import map_rasters
+from map_packages import alter, bound
 from terrafix.core.errors import MapError, UsageError
-from terrafix.core.geodesy import LocalFrame
 from terrafix.map.format import MANIFEST_TABLE
 from terrafix.map.null_model import VERSION, null_row_for
-from terrafix.map.package import LocalMap, MapPackage
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.cli import app
 from terrafix_tools.mapping.package import null_model
@@ -28,12 +26,6 @@ SIDE_PX, AGL_M = 500, 50.0  # 250 m
 def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("null")
     return map_rasters.utm(folder / "i.tif", map_rasters.texture(SIDE_PX, SIDE_PX, seed=4))
-
-
-def bound(package: Path) -> LocalMap:
-    opened = MapPackage.open(package)
-    west, south, east, north = opened.manifest.bounds_wgs84
-    return opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
 
 
 @pytest.fixture(scope="module")
@@ -71,13 +63,8 @@ def test_without_a_height_no_null_model_is_built(image: Path, tmp_path: Path) ->
 
 def test_an_altered_null_model_is_detected(measured: Path, tmp_path: Path) -> None:
     path = Path(shutil.copy(measured, tmp_path / "m.gpkg"))
-    db = sqlite3.connect(path)
-    (stored,) = db.execute(f"SELECT value FROM {MANIFEST_TABLE} WHERE key = 'layers'").fetchone()
-    layers = json.loads(stored)
-    layers[0]["null_model"]["rows"][0]["search"]["above"] = -50.0
-    db.execute(f"UPDATE {MANIFEST_TABLE} SET value = ? WHERE key = 'layers'", (json.dumps(layers),))
-    db.commit()
-    db.close()
+    above = "'$[0].null_model.rows[0].search.above', -50.0"
+    alter(path, f"UPDATE {MANIFEST_TABLE} SET value = json_set(value, {above}) WHERE key = 'layers'")
     with pytest.raises(MapError, match="checksum mismatch"):
         MapPackage.open(path)
 

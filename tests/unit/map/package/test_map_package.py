@@ -11,8 +11,8 @@ import pytest
 from rasterio.transform import Affine
 
 import map_rasters
+from map_packages import alter, bound
 from terrafix.core.errors import MapError
-from terrafix.core.geodesy import LocalFrame
 from terrafix.map.checksum import DIGEST_MARKER, EMPTY_DIGEST, VOLATILE_HEADER_BYTES
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build, build_package, layer_of
@@ -25,13 +25,6 @@ def package(tmp_path: Path) -> Path:
     return build(map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(600, 600)), tmp_path / "m.gpkg")
 
 
-def change(path: Path, statement: str) -> None:
-    db = sqlite3.connect(path)
-    db.execute(statement)
-    db.commit()
-    db.close()
-
-
 def test_missing_foreign_and_truncated_files_are_rejected(tmp_path: Path, package: Path) -> None:
     with pytest.raises(MapError, match="no such map package"):
         MapPackage.open(tmp_path / "none.gpkg")
@@ -40,7 +33,7 @@ def test_missing_foreign_and_truncated_files_are_rejected(tmp_path: Path, packag
     (tmp_path / "empty.gpkg").write_bytes(b"")
     with pytest.raises(MapError, match="not a map package"):
         MapPackage.open(tmp_path / "empty.gpkg")
-    change(tmp_path / "other.gpkg", "CREATE TABLE other (id INTEGER)")
+    alter(tmp_path / "other.gpkg", "CREATE TABLE other (id INTEGER)")
     with pytest.raises(MapError, match="not a Terrafix map package"):
         MapPackage.open(tmp_path / "other.gpkg")
     whole = package.read_bytes()
@@ -56,7 +49,7 @@ def test_missing_foreign_and_truncated_files_are_rejected(tmp_path: Path, packag
 def test_a_future_format_asks_for_an_update_and_an_earlier_one_for_a_build(
     package: Path, version: str, remedy: str
 ) -> None:
-    change(package, f"UPDATE terrafix_manifest SET value = '{version}' WHERE key = 'format_version'")
+    alter(package, f"UPDATE terrafix_manifest SET value = '{version}' WHERE key = 'format_version'")
     with pytest.raises(MapError, match=f"format {version}.*{remedy}"):
         MapPackage.open(package)
 
@@ -71,7 +64,7 @@ def test_a_future_format_asks_for_an_update_and_an_earlier_one_for_a_build(
     ],
 )
 def test_an_altered_manifest_or_tile_list_is_detected_at_opening(package: Path, statement: str) -> None:
-    change(package, statement)
+    alter(package, statement)
     with pytest.raises(MapError, match="checksum mismatch"):
         MapPackage.open(package)
 
@@ -81,11 +74,9 @@ def test_an_altered_tile_is_missing_in_flight_and_an_error_when_verified(package
         "UPDATE imagery SET tile_data = (SELECT tile_data FROM imagery WHERE zoom_level = 0)"
         " WHERE zoom_level = 2 AND tile_column = 1 AND tile_row = 1"
     )
-    change(package, swap)
+    alter(package, swap)
     opened = MapPackage.open(package)
-    west, south, east, north = opened.manifest.bounds_wgs84
-    local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
-    image, valid = local.window(-100.0, 100.0, 400, 400, 0.5)
+    image, valid = bound(opened).window(-100.0, 100.0, 400, 400, 0.5)
     assert 0.2 < valid.mean() < 0.8 and not image[~valid].any()
     assert opened.damaged_tiles == {("imagery", 2, 1, 1)}
     with pytest.raises(MapError, match="zoom 2 column 1 row 1"):
@@ -96,7 +87,7 @@ def test_an_altered_tile_is_missing_in_flight_and_an_error_when_verified(package
 
 
 def test_a_lost_tile_is_detected(package: Path) -> None:
-    change(package, "DELETE FROM imagery WHERE zoom_level = 2 AND tile_column = 0 AND tile_row = 0")
+    alter(package, "DELETE FROM imagery WHERE zoom_level = 2 AND tile_column = 0 AND tile_row = 0")
     with pytest.raises(MapError, match="zoom 2 column 0 row 0"):
         MapPackage.open(package, verify=True)
 
@@ -112,8 +103,7 @@ def everything(path: Path, *, verify: bool = True) -> tuple[object, ...]:
     """All data that a flight can read from a package."""
     opened = MapPackage.open(path, verify=verify)
     try:
-        west, south, east, north = opened.manifest.bounds_wgs84
-        local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
+        (west, south, east, north), local = opened.manifest.bounds_wgs84, bound(opened)
         image, valid = local.window(-160.0, 160.0, 320, 320, 1.0)
         far, _ = local.window(-160.0, 160.0, 80, 80, 4.0)
         up = local.elevation(np.linspace(-100, 100, 50), np.zeros(50))
@@ -162,9 +152,9 @@ def test_a_flipped_bit_anywhere_is_detected(tmp_path: Path) -> None:
 
 def test_swapped_tiles_are_detected(package: Path) -> None:
     """Two valid tiles at swapped positions."""
-    change(package, "UPDATE imagery SET tile_column = 9 WHERE zoom_level = 2 AND tile_column = 0 AND tile_row = 0")
-    change(package, "UPDATE imagery SET tile_column = 0 WHERE zoom_level = 2 AND tile_column = 1 AND tile_row = 0")
-    change(package, "UPDATE imagery SET tile_column = 1 WHERE zoom_level = 2 AND tile_column = 9 AND tile_row = 0")
+    alter(package, "UPDATE imagery SET tile_column = 9 WHERE zoom_level = 2 AND tile_column = 0 AND tile_row = 0")
+    alter(package, "UPDATE imagery SET tile_column = 0 WHERE zoom_level = 2 AND tile_column = 1 AND tile_row = 0")
+    alter(package, "UPDATE imagery SET tile_column = 1 WHERE zoom_level = 2 AND tile_column = 9 AND tile_row = 0")
     with pytest.raises(MapError, match="zoom 2 column 0 row 0 was altered"):
         MapPackage.open(package, verify=True)
 
@@ -174,8 +164,8 @@ def test_the_georeference_is_read_from_the_manifest_and_not_the_geopackage_table
 
     The file digest covers them."""
     before = everything(package)
-    change(package, "UPDATE gpkg_tile_matrix_set SET min_x = min_x + 1000, max_y = max_y + 1000")
-    change(package, "UPDATE gpkg_tile_matrix SET pixel_x_size = 2 * pixel_x_size")
+    alter(package, "UPDATE gpkg_tile_matrix_set SET min_x = min_x + 1000, max_y = max_y + 1000")
+    alter(package, "UPDATE gpkg_tile_matrix SET pixel_x_size = 2 * pixel_x_size")
     assert everything(package, verify=False) == before
     with pytest.raises(MapError, match="altered since it was built"):
         everything(package)
@@ -206,8 +196,7 @@ def test_a_blank_file_digest_is_accepted_and_a_missing_one_is_not(package: Path)
 def test_a_package_is_closed_with_the_last_of_its_views_whatever_thread_opened_it(package: Path) -> None:
     with ThreadPoolExecutor(1) as other:
         opened = other.submit(MapPackage.open, package).result()
-    database, (west, south, east, north) = opened._db, opened.manifest.bounds_wgs84
-    elevation = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2)).elevation
+    database, elevation = opened._db, bound(opened).elevation
     del opened
     assert elevation(np.zeros(1), np.zeros(1)) is None, "a map without elevation, which is open"
     database.execute("SELECT 1")

@@ -9,6 +9,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 import map_rasters
+from map_packages import alter, centre_of
 from terrafix.core.errors import ConfigError, MapError, OutputError, UsageError
 from terrafix.core.signature import TrustedKey, generate, is_signed, read_public, trusted_keys
 from terrafix.map.checksum import write_file_digest
@@ -26,13 +27,6 @@ def package(tmp_path: Path) -> Path:
 def keys(folder: Path, name: str = "op") -> tuple[Path, Path, TrustedKey]:
     private, public = folder / f"{name}.key", folder / f"{name}.pub"
     return private, public, generate(private, public, "somebody")
-
-
-def change(path: Path, statement: str, *values: object) -> None:
-    db = sqlite3.connect(path)
-    db.execute(statement, values)
-    db.commit()
-    db.close()
 
 
 def test_signatures_follow_rfc_8032() -> None:
@@ -82,11 +76,11 @@ def test_unsigned_foreign_and_altered_packages_are_rejected_with_the_reason(tmp_
         MapPackage.open(package, trusted=[other])
     MapPackage.open(package, trusted=[other, key]).close()
     whole = package.read_bytes()
-    change(package, "UPDATE terrafix_manifest SET value = 'mine' WHERE key = 'licence'")
+    alter(package, "UPDATE terrafix_manifest SET value = 'mine' WHERE key = 'licence'")
     with pytest.raises(MapError, match="checksum mismatch"):
         MapPackage.open(package)
     package.write_bytes(whole)
-    change(package, "UPDATE terrafix_signature SET signature = zeroblob(64)")
+    alter(package, "UPDATE terrafix_signature SET signature = zeroblob(64)")
     with pytest.raises(MapError, match="wrong signature"):  # also when no signature is required
         MapPackage.open(package)
 
@@ -98,15 +92,15 @@ def test_a_forged_checksum_does_not_pass_the_signature(tmp_path: Path, package: 
     db = sqlite3.connect(package)
     row = db.execute("SELECT key_id, public_key, signature FROM terrafix_signature").fetchone()
     db.close()
-    change(other, "INSERT INTO terrafix_signature (key_id, public_key, signature) VALUES (?, ?, ?)", *row)
+    alter(other, "INSERT INTO terrafix_signature (key_id, public_key, signature) VALUES (?, ?, ?)", *row)
     with pytest.raises(MapError, match="wrong signature"):
         MapPackage.open(other, trusted=[key])
     # The attacker's key under the id of the trusted one.
     mine, _, attacker = keys(tmp_path, "attacker")
-    change(other, "DELETE FROM terrafix_signature")
+    alter(other, "DELETE FROM terrafix_signature")
     write_file_digest(other)  # needs no key: the file digest protects against accidents only
     sign_package(other, mine)
-    change(other, "UPDATE terrafix_signature SET key_id = ?", key.key_id)
+    alter(other, "UPDATE terrafix_signature SET key_id = ?", key.key_id)
     with pytest.raises(MapError, match="wrong signature"):
         MapPackage.open(other, trusted=[key])
     assert attacker != key
@@ -125,7 +119,7 @@ def test_two_keys_can_sign_and_signing_twice_changes_nothing(tmp_path: Path, pac
 
 def test_a_damaged_package_is_not_signed(tmp_path: Path, package: Path) -> None:
     private, _, _ = keys(tmp_path)
-    change(
+    alter(
         package,
         "UPDATE imagery SET tile_data = zeroblob(100) WHERE zoom_level = 1 AND tile_column = 0 AND tile_row = 0",
     )
@@ -176,16 +170,14 @@ def test_a_run_that_requires_signatures_rejects_an_unsigned_map_before_it_starts
     private, public, _ = keys(tmp_path)
     config = tmp_path / "my.toml"
     config.write_text(f'[map]\nrequire_signature = true\ntrusted_keys = ["{public}"]\n')
-    opened = MapPackage.open(package)
-    west, south, east, north = opened.manifest.bounds_wgs84
-    opened.close()
-    start = f"{(south + north) / 2},{(west + east) / 2}"
+    centre = centre_of(package)
+    start = f"{centre.lat_deg},{centre.lon_deg}"
     with pytest.raises(MapError, match="not signed"):
         package_for("/dev/video0", start, package, [config])
     assert package_for("/dev/video0", start, package, []) == (package, None)
     sign_package(package, private)
     assert package_for("/dev/video0", start, package, [config]) == (package, None)
-    change(
+    alter(
         package, "UPDATE imagery SET tile_data = zeroblob(9) WHERE zoom_level = 1 AND tile_column = 0 AND tile_row = 0"
     )
     with pytest.raises(MapError, match="altered or lost"):  # verifies every tile, not only the tile list

@@ -1,7 +1,6 @@
 """Roads, water and buildings in a package, compared with GDAL's reader."""
 
 import json
-import sqlite3
 import struct
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 
 import map_rasters
 from map_features import HOLE, LAT, LON, ROAD, SQUARE, features, line
+from map_packages import alter
 from terrafix.core.errors import MapError
 from terrafix.map.package import MapPackage
 from terrafix.map.vectors import wkb_parts
@@ -67,12 +67,7 @@ def test_reading_features_of_a_box_returns_parts_and_attributes(package: Path) -
     ],
 )
 def test_altered_features_are_detected(package: Path, statement: str) -> None:
-    db = sqlite3.connect(package)
-    for (trigger,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
-        db.execute(f'DROP TRIGGER "{trigger}"')  # they call functions that only GeoPackage editors provide
-    db.execute(statement)
-    db.commit()
-    db.close()
+    alter(package, statement)
     opened = MapPackage.open(package)
     with pytest.raises(MapError, match="features of roads were altered"):
         opened.features("roads", LON - 1, LAT - 1, LON + 2, LAT + 2)

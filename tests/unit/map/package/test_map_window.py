@@ -13,18 +13,12 @@ from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 
 import map_rasters
+from map_packages import bound, centre_of
 from terrafix.core.geodesy import LocalFrame, local_crs
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix_tools.mapping.build import build
 
 SIDE_PX = 900
-
-
-def placed(tmp_path: Path, crs: str, lat_deg: float, lon_deg: float, pixel: float) -> Path:
-    """A generated GeoTIFF around a position."""
-    x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(lon_deg, lat_deg)
-    corner = Affine(pixel, 0, x - SIDE_PX * pixel / 2, 0, -pixel, y + SIDE_PX * pixel / 2)
-    return map_rasters.write_tif(tmp_path / "image.tif", map_rasters.texture(SIDE_PX, SIDE_PX), crs, corner)
 
 
 def reference(tif: Path, frame: LocalFrame, e_min_m: float, n_max_m: float, side_px: int, gsd_m: float) -> np.ndarray:
@@ -74,7 +68,8 @@ def render(local: LocalMap, gsd_m: float, side_px: int) -> tuple[np.ndarray, flo
 )
 def test_a_window_has_the_position_that_gdal_computes(tmp_path: Path, crs: str, lat_deg: float, lon_deg: float) -> None:
     pixel = 0.5 / 0.3048 if crs == "EPSG:2263" else 0.5
-    tif = placed(tmp_path, crs, lat_deg, lon_deg, pixel)
+    texture = map_rasters.texture(SIDE_PX, SIDE_PX)
+    tif = map_rasters.around(tmp_path / "image.tif", texture, crs, (lat_deg, lon_deg), pixel)
     package = MapPackage.open(build(tif, tmp_path / "map.gpkg"), verify=True)
     scale = math.cos(math.radians(lat_deg)) if crs == "EPSG:3857" else 1.0
     assert package.manifest.gsd_m == pytest.approx(0.5 * scale, rel=5e-3)
@@ -128,15 +123,12 @@ def test_downsampled_windows_do_not_alias(tmp_path: Path) -> None:
     """A pattern finer than the window's pixels becomes grey, at every scale."""
     rows, columns = np.mgrid[0:1024, 0:1024]
     bands = np.repeat(np.where((rows + columns) % 2, 200, 56).astype(np.uint8)[None], 3, axis=0)
-    package = MapPackage.open(build(map_rasters.utm(tmp_path / "fine.tif", bands), tmp_path / "fine.gpkg"))
-    west, south, east, north = package.manifest.bounds_wgs84
-    local = package.bind(LocalFrame((south + north) / 2, (west + east) / 2))
+    local = bound(build(map_rasters.utm(tmp_path / "fine.tif", bands), tmp_path / "fine.gpkg"))
     for factor in (1.5, 1.8, 2.5, 4.0, 7.3):
         image, valid = local.window(-100.0, 100.0, round(400 / factor), round(400 / factor), local.gsd_m * factor)
         assert valid.all()
         assert image.std() < 12
         assert image.mean() == pytest.approx(128, abs=2)
-    package.close()
 
 
 @pytest.mark.parametrize(("height", "width"), [(300, 400), (512, 512), (256, 256)])
@@ -144,8 +136,8 @@ def test_the_area_outside_is_zero_and_invalid_with_sharp_edges(tmp_path: Path, h
     package = MapPackage.open(
         build(map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(height, width)), tmp_path / "i.gpkg")
     )
-    west, south, east, north = package.manifest.bounds_wgs84
-    local = package.bind(LocalFrame((south + north) / 2, (west + east) / 2))
+    (west, south, _, _), centre = package.manifest.bounds_wgs84, centre_of(package)
+    local = package.bind(centre)
     e_min, n_min, e_max, n_max = local.bounds_m
     image, valid = local.window(e_min - 50, n_max + 50, 740, 740, 0.5)
     assert not image[~valid].any()
@@ -155,22 +147,18 @@ def test_the_area_outside_is_zero_and_invalid_with_sharp_edges(tmp_path: Path, h
     assert (e_max - e_min, n_max - n_min) == pytest.approx((width / 2, height / 2), abs=6)
     far, nothing = local.window(1e6, 1e6, 64, 32, 0.5)
     assert far.shape == (32, 64, 3) and not far.any() and not nothing.any()
-    assert package.covers((south + north) / 2, (west + east) / 2)
+    assert package.covers(centre.lat_deg, centre.lon_deg)
     assert not package.covers(south - 0.01, west)
     assert not package.covers(-80.0, 10.0)
-    beyond = LocalFrame((south + north) / 2, (west + east) / 2).to_wgs84(0.0, n_max + 80.0)
+    beyond = centre.to_wgs84(0.0, n_max + 80.0)
     assert not package.covers(*beyond)
     assert package.covers_start(*beyond, 60.0) and not package.covers_start(*beyond, 10.0)
     package.close()
 
 
 def test_the_tile_cache_does_not_change_a_window(tmp_path: Path) -> None:
-    path = build(map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(600, 600)), tmp_path / "i.gpkg")
-    package = MapPackage.open(path)
-    west, south, east, north = package.manifest.bounds_wgs84
-    local = package.bind(LocalFrame((south + north) / 2, (west + east) / 2))
+    local = bound(build(map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(600, 600)), tmp_path / "i.gpkg"))
     first = local.window(-100.0, 100.0, 300, 300, 0.61)
     local.window(-60.0, 90.0, 200, 200, 1.3)
     second = local.window(-100.0, 100.0, 300, 300, 0.61)
     assert np.array_equal(first[0], second[0]) and np.array_equal(first[1], second[1])
-    package.close()
