@@ -94,7 +94,7 @@ class _SeenPosition:
 class _Step:
     """One frame before it is added to the graph. ``increment``: of the motion model since ``before``, the newest node;
     None: the vehicle stands. ``predicted_cov``: of position and velocity at its end, ``predicted_m`` (3,),
-    ``velocity``."""
+    ``predicted_motion`` (8,) of V."""
 
     frame: FrameInput
     before: NodeState
@@ -102,7 +102,7 @@ class _Step:
     increment: MotionIncrement | None
     predicted_cov: np.ndarray
     predicted_m: np.ndarray
-    velocity: np.ndarray
+    predicted_motion: np.ndarray
     turn: Turn | None = None
     verdicts: list[FusionVerdict] = field(default_factory=list)
     parent: int = -1
@@ -191,10 +191,10 @@ class Propagation:
             increment = seen_increment()
         elif not stands:
             increment = self._increment(frame, before, seen=seen)
-        cov = predict_covariance(increment, self._state.velocity_cov)
+        cov = predict_covariance(increment, self._state.motion_cov)
         p_m, velocity = before.pose.translation(), np.zeros(MOTION_SIZE)
         if increment is not None:
-            p_m, velocity = increment.predict(p_m, before.velocity, float(before.bias[HEADING]))
+            p_m, velocity = increment.predict(p_m, before.motion, float(before.calibration[HEADING]))
         return _Step(frame, before, sighting, increment, cov, p_m, velocity)
 
     def _increment(self, frame: FrameInput, before: NodeState, *, seen: bool) -> MotionIncrement:
@@ -204,12 +204,14 @@ class Propagation:
         from_s = state.graph.time_of(state.graph.newest)
         measured = frame.imu(round(from_s * 1e9), round(frame.t_s * 1e9))
         r_w_c = before.pose.rotation().matrix()
-        yaws = tuple(state.camera.yaw_rad(r) for r in (r_w_c, state.camera.expected(attitude, before.bias, r_w_c)))
+        yaws = tuple(
+            state.camera.yaw_rad(r) for r in (r_w_c, state.camera.expected(attitude, before.calibration, r_w_c))
+        )
         return integrate_motion(
             state.graph.since_newest_s(frame.t_s),
             measured,
             (yaws[0], yaws[1]),
-            float(before.bias[HEADING]),
+            float(before.calibration[HEADING]),
             state.speed_prior.speed_mps,
             float(np.hypot(np.radians(state.origin.attitude_sigma_deg), attitude.righted_rad)),
             same_source=state.continuity.last_increment_inertial is (measured is not None),
@@ -263,7 +265,7 @@ class Propagation:
         step_m = (step.predicted_m - step.before.pose.translation())[:2]
         joined = step.known is not None and step.sighting.fragment.joined
         placed = continue_from(
-            self._state, step.frame, step.predicted_m, step.velocity, step.predicted_cov, joined=joined
+            self._state, step.frame, step.predicted_m, step.predicted_motion, step.predicted_cov, joined=joined
         )
         sigma_m, verdicts = _worst_sigma(step.predicted_cov[:2, :2]), (*step.verdicts, reset)
         return PropagationResult(verdict, placed, step_m, sigma_m, verdicts=verdicts)
@@ -302,7 +304,7 @@ class Propagation:
                     step.increment, step.seen.off_m, step.predicted_cov, seen
                 )
                 # Otherwise a correct increment would fall in the robust tail of its factor (factors/motion.py).
-                step.velocity = step.velocity + gained
+                step.predicted_motion = step.predicted_motion + gained
         self._fragment_step(step)
 
     def _seen_step(self, step: _Step, known: KeyframeMotion, seen_m2: np.ndarray) -> None:
@@ -348,7 +350,7 @@ class Propagation:
             state.graph.keep(parent)
         node = state.graph.state(parent)
         r_parent = node.pose.rotation().matrix()
-        r_w_c = state.camera.expected(attitude, node.bias, r_parent)
+        r_w_c = state.camera.expected(attitude, node.calibration, r_parent)
         reported_rad = np.hypot(np.radians(state.origin.yaw_sigma_deg), attitude.turned_rad)
         yaw_sigma = TURN_UNSEEN_RAD if attitude.yaw_rad is None else reported_rad
         turn = UNKNOWN_ATTITUDE_RAD + yaw_sigma
@@ -367,30 +369,30 @@ class Propagation:
         rise_m = state.terrain.rise_sigma_m(float(np.hypot(*step.step_m)))
         increment = step.increment
         # No velocity bridge: what the fragment tells of its velocity says nothing of the way that was not seen.
-        velocity_cov = step.predicted_cov[DELTA_MOTION, DELTA_MOTION] if step.sighting.begins_disconnected else None
+        motion_cov = step.predicted_cov[DELTA_MOTION, DELTA_MOTION] if step.sighting.begins_disconnected else None
         if increment is not None:
             increment = replace(increment, terrain_unknown=not state.terrain.has_dem)
             if step.known is not None:
                 increment = increment.in_height_units(max(float(p[UP]) - ground_m, 1.0), ground_m)
         three = None if step.known is None else self._odometry.three_view(step.known)
-        first = NodeState(step.pose, step.before.bias, step.velocity)
+        first = NodeState(step.pose, step.before.calibration, step.predicted_motion)
         motion, links = self._linked(step)
-        new = NewNode(first, step.parent, motion, increment, attitude, rise_m, three, velocity_cov, links)
+        new = NewNode(first, step.parent, motion, increment, attitude, rise_m, three, motion_cov, links)
         state.keep_keyframes(state.graph.leaving)
         walk, parent = self._walk_sigmas(step), state.graph.state(step.parent)
         node = state.graph.extend(frame.t_s, new)
-        state.velocity_cov = self._velocity_cov(step)
-        state.covariances.extended(new, parent, walk, state.velocity_cov)
+        state.motion_cov = self._motion_cov(step)
+        state.covariances.extended(new, parent, walk, state.motion_cov)
         self._continuity_of(step, node)
         state.register_frame(node, frame.frame_id, step.sighting.fragment)
         step.verdicts += self._fuse_aids(step, node, dt_s)
-        state.last = state.frame_state(frame.frame_id, frame.t_s, node)
+        last = state.refresh_newest()
         if step.known is not None:
             state.last_seen_s = frame.t_s
-            state.speed_prior.update(frame.t_s, state.last.velocity_mps, state.last.velocity_cov)
+            state.speed_prior.update(frame.t_s, last.velocity_mps, last.velocity_cov)
             for aid in self._aids:
-                aid.after_frame(state.last, frame.attitude)
-        return replace(self._result(step, state.last), motion=step.sighting.motion)
+                aid.after_frame(last, frame.attitude)
+        return replace(self._result(step, last), motion=step.sighting.motion)
 
     def _linked(self, step: _Step) -> tuple[RelativePose, tuple[tuple[int, MatchedRays], ...]]:
         """The motion since the parent, and node and matched rays of each further keyframe that agrees with it."""
@@ -408,13 +410,13 @@ class Propagation:
         shared = replace(step.motion, rays=step.motion.rays.sharing(count))
         return shared, tuple((keyframe, rays.sharing(count)) for keyframe, rays in accepted)
 
-    def _velocity_cov(self, step: _Step) -> np.ndarray:
+    def _motion_cov(self, step: _Step) -> np.ndarray:
         """Covariance (8, 8) of V of the newest node by the motion model and odometry. A motion factor that has less
         weight in the graph has it here, too."""
         state, predicted_cov = self._state, step.predicted_cov
         if state.mode is CovarianceMode.JACOBIAN and step.seen is not None and step.increment is not None:
             increment = replace(step.increment, cov=step.increment.cov / state.graph.motion_weight)
-            predicted_cov = predict_covariance(increment, state.velocity_cov)
+            predicted_cov = predict_covariance(increment, state.motion_cov)
             _, predicted_cov, _ = fuse_odometry_increment(increment, step.seen.off_m, predicted_cov, step.seen.cov_m2)
         return predicted_cov[DELTA_MOTION, DELTA_MOTION]
 
@@ -455,7 +457,7 @@ class Propagation:
             verdicts.append(verdict)
             if aid.leads_step and not observed and verdict.verdict is Verdict.ACCEPTED:
                 moved = state.graph.state(node).pose.translation() - step.before.pose.translation()
-                cov = replace_motion_covariance(step.predicted_cov, state.velocity_cov)
+                cov = replace_motion_covariance(step.predicted_cov, state.motion_cov)
                 step.step_m, step.step_sigma_m = moved[:2], _worst_sigma(cov[:2, :2])
         return verdicts
 
@@ -531,7 +533,7 @@ class Propagation:
         fused = self._fuse_aid(self._dead_reckoning, sample)
         if fused is None or fused.verdict is not Verdict.ACCEPTED:
             return False
-        state.last = state.frame_state(last.frame_id, last.t_s, last.node)
+        state.refresh_newest()
         return True
 
     def _initialize(
@@ -545,12 +547,12 @@ class Propagation:
         state.keyframes.clear()  # what was assumed for them has turned out to be wrong
         sample = AidSample(placed.node, frame.t_s, frame.attitude, frame.imu, 0.0, True)
         fused = self._fuse_aid(self._dead_reckoning, sample)
-        state.last = state.frame_state(frame.frame_id, frame.t_s, placed.node)
+        placed = state.refresh_newest()
         verdicts = [FusionVerdict("odometry", Verdict.ACCEPTED)]
         verdicts += [_reset_verdict(reason)] if rejected is None else [rejected, _reset_verdict(reason)]
         verdicts += [] if fused is None else [fused]
         way_m, sigma_m = initial.way_m, initial.way_sigma_m
-        return PropagationResult(Verdict.ACCEPTED, state.last, way_m, sigma_m, verdicts=tuple(verdicts))
+        return PropagationResult(Verdict.ACCEPTED, placed, way_m, sigma_m, verdicts=tuple(verdicts))
 
 
 def _reset_verdict(reason: ResetReason, detail: str = "") -> FusionVerdict:

@@ -64,9 +64,8 @@ class RelocalizationUpdate:
         fusion = fuse(state, node, measurement)
         if fusion.verdict is not Verdict.ACCEPTED:
             return fusion
-        assert state.last is not None
         state.last_seen_s = max(state.last_seen_s, state.graph.time_of(node))
-        state.last = state.frame_state(state.last.frame_id, state.last.t_s, state.graph.newest)
+        state.refresh_newest()
         return fusion
 
 

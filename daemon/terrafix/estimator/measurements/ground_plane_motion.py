@@ -35,7 +35,7 @@ def plane_motion(
     if ground.level_sigma_m > MAX_LEVEL_SIGMA * height_m:
         return Verdict.DEGENERATE
     ground = replace(ground, rise_sigma_m=state.terrain.rise_sigma_m(way_m))
-    pairs, radial_k1 = np.array(seen.two_view), float(state.graph.state(newest).bias[RADIAL_K1])
+    pairs, radial_k1 = np.array(seen.two_view), float(state.graph.state(newest).calibration[RADIAL_K1])
     motion = relative_pose(pairs, seen.sigma_norm, r_w_kf, *expected, ground, radial_k1)
     return Verdict.FEW_INLIERS if motion is None else motion
 

@@ -26,5 +26,5 @@ def heading_innovation(
     sigma_rad = float(np.sqrt(reported2 + COMPASS_SWING_RAD**2 + cov[WORLD_YAW, WORLD_YAW]))
     if attitude.yaw_rad is None:
         return ScalarInnovation(0.0, sigma_rad)
-    reported_rad = state.camera.yaw_rad(state.camera.expected(attitude, before.bias))
+    reported_rad = state.camera.yaw_rad(state.camera.expected(attitude, before.calibration))
     return ScalarInnovation(math.remainder(reported_rad - yaw_rad, math.tau), sigma_rad)

@@ -21,7 +21,7 @@ def height_innovation(
     ``moved_m2``: variance of the climb since ``before``, the newest node."""
     assert state.last is not None
     ground_m = state.terrain.elevation_m(p_m)
-    expected_m = np.exp(before.bias[LOG_HEIGHT_SCALE]) * (float(p_m[UP] + before.bias[HEIGHT]) - ground_m)
+    expected_m = np.exp(before.calibration[LOG_HEIGHT_SCALE]) * (float(p_m[UP] + before.calibration[HEIGHT]) - ground_m)
     reported_m = (state.origin.ground_amsl_m or 0.0) + agl_m - ground_m
     cov = tangent_to_world(state.last.cov, before.pose.rotation().matrix())
     sigma_m = float(np.sqrt(state.origin.agl_sigma_m**2 + cov[UP, UP] + moved_m2))

@@ -132,7 +132,7 @@ class OdometryMeasurement:
         node = state.graph.state(parent)
         r_w_kf = node.pose.rotation().matrix()
         rotations = (r_w_kf, r_w_kf @ sighting.motion.motion.r)
-        yaw_kf_rad, yaw_rad = (yaw_of(state.camera.body(r_w_c, node.bias)) for r_w_c in rotations)
+        yaw_kf_rad, yaw_rad = (yaw_of(state.camera.body(r_w_c, node.calibration)) for r_w_c in rotations)
         since_rad = yaw_rad - yaw_kf_rad
         self._heading_seen = (odometry.t_ns, odometry.keyframe_id, since_rad)
         if before is not None and before[1] == odometry.keyframe_id:
@@ -150,14 +150,14 @@ class OdometryMeasurement:
             return None
         before, middle = state.graph.state(first), state.graph.state(seen.parent)
         ground_m = state.terrain.elevation_m(middle.pose.translation())
-        risen = 0.0 if state.terrain.has_dem else float(before.bias[HEIGHT] - middle.bias[HEIGHT])
+        risen = 0.0 if state.terrain.has_dem else float(before.calibration[HEIGHT] - middle.calibration[HEIGHT])
         moved = gtsam.Pose3(before.pose.rotation(), before.pose.translation() + np.array([0.0, 0.0, risen]))
         guess = ThreeViewPose(
             middle.pose.between(moved),
             seen.motion.between,
             float(middle.pose.translation()[UP]) - ground_m,
             ground_m,
-            float(middle.bias[RADIAL_K1]),
+            float(middle.calibration[RADIAL_K1]),
         )
         triples, sigma_norm = np.array(odometry.three_view), odometry.three_view_sigma_norm
         constraint = three_view_constraint(triples, sigma_norm, guess, state.origin.camera.focal_sigma)
@@ -171,12 +171,12 @@ class OdometryMeasurement:
     ) -> MotionInnovation:
         """Innovation of a camera position ``p_m`` (3,) by odometry, against the motion model."""
         state = self._state
-        predicted_m, _ = increment.predict(before.pose.translation(), before.velocity, float(before.bias[HEADING]))
+        predicted_m, _ = increment.predict(before.pose.translation(), before.motion, float(before.calibration[HEADING]))
         dt_s = state.graph.since_newest_s(t_s)
-        cov_m2 = predict_covariance(increment, state.velocity_cov)[:3, :3]
+        cov_m2 = predict_covariance(increment, state.motion_cov)[:3, :3]
         if not state.fragments.of(seen.parent).confirmed:  # the motion model alone led here from the keyframe
             since_s = t_s - state.graph.time_of(seen.parent)
-            cov_m2 += state.velocity_cov[VELOCITY, VELOCITY] * max(since_s**2 - dt_s**2, 0.0)
+            cov_m2 += state.motion_cov[VELOCITY, VELOCITY] * max(since_s**2 - dt_s**2, 0.0)
         r_w_c = state.graph.state(seen.parent).pose.rotation().matrix() @ seen.motion.r
         seen_m2 = r_w_c @ seen.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T
         return MotionInnovation(p_m - predicted_m, cov_m2 + seen_m2, dt_s, increment.inertial)
@@ -218,9 +218,9 @@ class OdometryMeasurement:
             return Verdict.STALE
         keyframe = state.graph.state(parent)
         p = keyframe.pose.translation()
-        view = KeyframeView(keyframe.pose, state.covariances.recent_pose(parent), state.terrain.elevation_m(p))
+        view = KeyframeView(keyframe.pose, state.covariances.recorded_pose(parent), state.terrain.elevation_m(p))
         newest = state.graph.state(state.graph.newest)
-        onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - state.graph.time_of(state.graph.newest))
+        onward = newest.motion[:3] * (odometry.t_ns * 1e-9 - state.graph.time_of(state.graph.newest))
         way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
         motion = plane_motion(state, view, odometry, self._expected_rotation(frame, keyframe), way_m)
         if isinstance(motion, Verdict):
@@ -234,6 +234,6 @@ class OdometryMeasurement:
         r_w_kf = keyframe.pose.rotation().matrix()
         if frame.attitude.pitch_rad is None or frame.attitude.roll_rad is None:
             return r_w_kf, UNKNOWN_ATTITUDE_RAD
-        r_w_k = self._state.camera.expected(frame.attitude, keyframe.bias, r_w_kf)
+        r_w_k = self._state.camera.expected(frame.attitude, keyframe.calibration, r_w_kf)
         tilt_rad = np.radians(max(self._state.origin.attitude_sigma_deg, 1.0))
         return r_w_k, float(np.hypot(tilt_rad, frame.attitude.stale * UNKNOWN_ATTITUDE_RAD))
