@@ -10,7 +10,7 @@ import numpy as np
 
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, method_of, solved
+from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, SEARCH_RADIUS, method_of, solved
 from terrafix.core.pose import project_with_jacobian
 from terrafix.estimator.claim import Claim, claim
 from terrafix.estimator.estimator import Estimator
@@ -178,7 +178,7 @@ def _with_pnp_input(match: MatchResult, camera: CameraCalibration, state: Filter
         sigma_floor=1.0 / camera.fx,
         threshold=INLIER_THRESHOLD,
         search_radius=SEARCH_RADIUS,
-        min_inliers=MIN_INLIERS,
+        min_inliers=PNP_MIN_INLIERS,
     )
     return msgspec.structs.replace(match, pnp=given)
 

@@ -31,7 +31,7 @@ MIN_CORNER_DISTANCE_PX = 12
 KLT_WINDOW_PX = 21
 KLT_LEVELS = 4
 FORWARD_BACKWARD_PX = 1.0  # forward-backward check: larger return error rejects a track (Kalal 2010)
-MIN_INLIERS = 20
+TRACK_MIN_INLIERS = 20
 MIN_INLIER_RATIO = 0.35
 # Median shift for a new keyframe, fraction of the image width: nine tenths still overlap. It moves smoothly and far
 # from frame to frame, where the number of corners that are still tracked falls by a few: as the first to be reached, it
@@ -142,7 +142,7 @@ class FrameTracker:
             return self._new_fragment(frame_id, gray)
         keyframe.age += 1
         index, points, tracked = self._track_klt(keyframe, gray)
-        enough = len(index) >= max(MIN_INLIERS, MIN_INLIER_RATIO * tracked)
+        enough = len(index) >= max(TRACK_MIN_INLIERS, MIN_INLIER_RATIO * tracked)
         if enough and self._covers_images(keyframe.corners[index], points):
             return self._accept_tracks(keyframe, frame_id, gray, index, points, tracked)
         detail = _gray_copy(image, self._detail_scale) if self._detail_scale > self._scale else None
@@ -193,7 +193,7 @@ class FrameTracker:
     def _track_klt(self, keyframe: _Keyframe, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         """KLT from the last tracked frame. -> indices (N,) of the keyframe's corners that agree with one homography,
         their positions (N, 2) px in this frame, and the number of tracked corners."""
-        if self._last_gray is None or len(self._last_points) < MIN_INLIERS:
+        if self._last_gray is None or len(self._last_points) < TRACK_MIN_INLIERS:
             return _NONE, _NO_POINTS, 0
         window = (KLT_WINDOW_PX, KLT_WINDOW_PX)
         start = self._last_points.reshape(-1, 1, 2)
@@ -207,7 +207,7 @@ class FrameTracker:
         keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed
         positions, index = ahead.reshape(-1, 2)[keep], self._last_index[keep]
         inlier = homography_inliers(keyframe.corners[index], positions)
-        if inlier.sum() >= MIN_INLIERS:
+        if inlier.sum() >= TRACK_MIN_INLIERS:
             self._last_points, self._last_index, self._last_gray = positions[inlier], index[inlier], gray
         return index[inlier], positions[inlier], int(keep.sum())
 
@@ -234,7 +234,7 @@ class FrameTracker:
             triples = self._triples(keyframe, aligned, index[valid])
             self._start_keyframe(frame_id, gray, aligned, corners[valid], keyframe.frame_id)
         # Patch alignment fails on a blurred image, but the tracks are still valid.
-        if len(valid) < MIN_INLIERS or not self._covers_images(aligned, aligned):
+        if len(valid) < TRACK_MIN_INLIERS or not self._covers_images(aligned, aligned):
             aligned, valid = points, np.arange(len(points))
         return self._build_motion(keyframe, corners[valid], aligned, len(index), tracked, due=due, triples=triples)
 

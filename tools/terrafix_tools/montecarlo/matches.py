@@ -22,7 +22,7 @@ from terrafix.anchor.matching.patch_matcher import MAX_PATCHES
 from terrafix.anchor.matching.point_mass_filter import Mode, belief_cell_m
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.limits import MIN_MATCHING_AGL_M
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, solve
+from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, SEARCH_RADIUS, solve
 from terrafix.core.pose import log_so3
 from terrafix.messages import GroundPlane, MapMatch, MatchPlace, PnpInput, Prediction, Verdict
 from terrafix_tools.montecarlo.flown import Shot
@@ -103,7 +103,7 @@ class MapMatches:
             sigma_floor=0.3 * gsd_share,
             threshold=INLIER_THRESHOLD,
             search_radius=SEARCH_RADIUS,
-            min_inliers=MIN_INLIERS,
+            min_inliers=PNP_MIN_INLIERS,
         )
         return Fix(xy, points, weights, solve(points, xy, weights, given), gsd_share * view.agl_m, given)
 

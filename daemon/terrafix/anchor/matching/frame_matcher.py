@@ -15,7 +15,7 @@ from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, patch_centres, rectify
 from terrafix.anchor.matching.patch_matcher import match_patches
-from terrafix.anchor.matching.point_mass_filter import LLR_SLOPE, LLR_ZERO_Z, Surface
+from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_SLOPE, BELIEF_LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
@@ -23,7 +23,7 @@ from terrafix.core.pnp import (
     CUTOFF,
     INDEPENDENT_SHARE,
     INLIER_THRESHOLD,
-    MIN_INLIERS,
+    PNP_MIN_INLIERS,
     SEARCH_RADIUS,
     PnpResult,
     solve,
@@ -116,6 +116,12 @@ class CorrelationResult:
         best = int(np.argmax(scores))
         return self.hypotheses[best], scores[best]
 
+    def is_mapped_at(self, e_m: float, n_m: float) -> bool:
+        """Whether a feature is mapped where ``best_at`` finds the highest correlation."""
+        peaks = [(s, s.best(e_m, n_m, 2.0 * self.cell_m)) for s in self.surfaces]
+        surface, (_, there_e_m, there_n_m) = max(peaks, key=lambda peak: peak[1][0])
+        return surface.is_mapped(there_e_m, there_n_m)
+
     def best_hypotheses(self, count: int) -> tuple[Hypothesis, ...]:
         """The ``count`` hypotheses with the highest standardised correlation anywhere, in their order."""
         scores = [float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in self.surfaces]
@@ -133,7 +139,7 @@ class CorrelationResult:
         scores = np.array([z[s] for s in scales])
         if int(np.argmax(scores)) in (0, len(scales) - 1):
             return None
-        likelihood = np.exp(LLR_SLOPE * (scores - scores.max()))
+        likelihood = np.exp(BELIEF_LLR_SLOPE * (scores - scores.max()))
         likelihood /= likelihood.sum()
         mean = float(likelihood @ scales)
         # Remove the information of the grid itself ("one of these scales"): the prediction chose it.
@@ -261,9 +267,10 @@ class FrameMatcher:
             z = standardise(correlation)
             # Places without a mapped feature are neither excluded nor preferred: they are as frequent among right
             # places as among all (docs/decisions/042-vectors-as-a-layer.md).
-            if self._drawn:
-                z[np.isneginf(correlation)] = LLR_ZERO_Z
-            surfaces.append(Surface(z, e_min - frame.e_min_m, n_max - frame.n_max_m, cell))
+            unmapped = np.isneginf(correlation) if self._drawn else None
+            if unmapped is not None:
+                z[unmapped] = BELIEF_LLR_ZERO_Z
+            surfaces.append(Surface(z, e_min - frame.e_min_m, n_max - frame.n_max_m, cell, unmapped))
         if not any(np.isfinite(s.z).any() for s in surfaces):
             return CorrelationResult(Verdict.OUTSIDE_MAP)
         return CorrelationResult(Verdict.ACCEPTED, tuple(surfaces), tuple(h for h, _ in usable), footprint_m, cell)
@@ -331,7 +338,7 @@ class FrameMatcher:
             sigma_floor=0.3 * cell / view.agl_m,  # a third of a cell: accuracy of sub-cell interpolation of the peak
             threshold=threshold,
             search_radius=radius * cell / view.agl_m,
-            min_inliers=MIN_INLIERS if describer.stride == 1 else LEARNED_INLIERS,
+            min_inliers=PNP_MIN_INLIERS if describer.stride == 1 else LEARNED_INLIERS,
         )
         return Fix(xy, points, found.weight, solve(points, xy, found.weight, given), cell, given)
 

@@ -6,7 +6,7 @@ these may be too few, while the sum of all patch surfaces still shows where most
 """
 
 from terrafix.anchor.matching.frame_matcher import Fix, FrameMatcher, View
-from terrafix.anchor.relocalization.hypothesis_tracker import LLR_MAX, evidence
+from terrafix.anchor.verification.hypothesis_tracker import TRACK_LLR_MAX, evidence
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, PlaceVerifier
 from terrafix.core.node import Image
@@ -23,6 +23,6 @@ class ConsensusPose:
         first = self._verifier.verify(image, view, CELL_PER_AGL)
         if first is None or first.fix.pnp.fit is None:
             return None
-        if evidence(PatchNull().sigmas(first.consensus, fine=False)) < LLR_MAX:
+        if evidence(PatchNull().sigmas(first.consensus, fine=False)) < TRACK_LLR_MAX:
             return None
         return self._verifier.refine(image, view, first.fix)

@@ -20,7 +20,7 @@ from terrafix.anchor.matching.patch_matcher import correlate_patches
 from terrafix.anchor.verification.patch_consensus import MAX_LLR, PatchConsensus, estimate_consensus
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
-from terrafix.core.pnp import MIN_INLIERS, SEARCH_RADIUS, PnpResult
+from terrafix.core.pnp import PNP_MIN_INLIERS, SEARCH_RADIUS, PnpResult
 from terrafix.core.pose import fit_pose
 from terrafix.map.package import LocalMap
 from terrafix.messages import Verdict
@@ -84,7 +84,7 @@ class PlaceVerifier:
         corners, _, surfaces = correlate_patches(
             template, frame.mask, window, valid, patch, radius, row0, column0, centres
         )
-        if len(corners) < MIN_INLIERS:
+        if len(corners) < PNP_MIN_INLIERS:
             return None
         centres = np.array(corners) + 0.5 * patch
         ground_m = np.column_stack([frame.e_min_m + centres[:, 1] * cell_m, frame.n_max_m - centres[:, 0] * cell_m])
@@ -132,7 +132,7 @@ class PlaceVerifier:
         points, weights = np.column_stack([map_m, up]), np.clip(found.values / MAX_LLR, 0.0, 1.0)
         start = np.array([view.e_m, view.n_m, view.ground_m + view.agl_m])
         fit = None
-        if found.inliers.sum() >= MIN_INLIERS:
+        if found.inliers.sum() >= PNP_MIN_INLIERS:
             fit = fit_pose(
                 points[found.inliers],
                 xy[found.inliers],

@@ -11,7 +11,7 @@ from terrafix.anchor.matching.frame_matcher import Fix, View
 from terrafix.anchor.matching.match_message import mode_match, pose_match, relocalized_match
 from terrafix.anchor.matching.point_mass_filter import Mode
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, map_pose, solve, solved
+from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, SEARCH_RADIUS, map_pose, solve, solved
 from terrafix.core.pose import PoseFit
 from terrafix.messages import MapMatch, MatchPlace, PnpInput, Verdict
 
@@ -24,7 +24,7 @@ GIVEN = PnpInput(
     sigma_floor=0.0015,
     threshold=INLIER_THRESHOLD,
     search_radius=SEARCH_RADIUS,
-    min_inliers=MIN_INLIERS,
+    min_inliers=PNP_MIN_INLIERS,
 )
 BEFORE = MapMatch(
     t_ns=0, frame_id=3, verdict=Verdict.LOST, matcher="gradient", place=MatchPlace(e_m=0.0, n_m=0.0, mass=0.95)

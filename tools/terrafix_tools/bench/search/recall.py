@@ -22,8 +22,8 @@ import numpy as np
 import typer
 
 from terrafix.anchor.place_index.recognizer import PlaceMemory, PlaceRecognizer
-from terrafix.anchor.relocalization.hypothesis_tracker import MERGE_RADIUS, NEIGHBOUR_RADIUS
 from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.verification.hypothesis_tracker import MERGE_RADIUS, NEIGHBOUR_RADIUS
 from terrafix.core.config import Places
 from terrafix.core.errors import TerrafixError
 from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget

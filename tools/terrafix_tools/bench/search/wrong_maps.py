@@ -25,8 +25,8 @@ import typer
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher
 from terrafix.anchor.matching.predicted_view import view_of
-from terrafix.anchor.relocalization.hypothesis_tracker import NEW_EVIDENCE
 from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.verification.hypothesis_tracker import NEW_EVIDENCE
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import load
 from terrafix.core.errors import TerrafixError
