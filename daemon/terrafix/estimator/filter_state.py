@@ -81,14 +81,14 @@ class FrameContinuity:
     ``substitution``: for the keyframe of vision that the graph no longer has. ``last_increment_inertial``: whether the
     last motion increment came from inertial readings; None: there was none. ``stationary_node``: node at which a
     disarmed vehicle stands. ``keyframe_motion``: node of the keyframe of the newest odometry, and the position (3,) of
-    the newest frame in that camera. ``unseen_inertial``: inertial readings have measured all of the motion since the
-    last frame with fused odometry."""
+    the newest frame in that camera. ``inertial_since_fused``: inertial readings have measured all of the motion since
+    the last frame with fused odometry."""
 
     substitution: KeyframeSubstitution | None = None
     last_increment_inertial: bool | None = None
     stationary_node: int | None = None
     keyframe_motion: tuple[int, np.ndarray] | None = None
-    unseen_inertial: bool = True
+    inertial_since_fused: bool = True
 
 
 class FilterState:
@@ -114,7 +114,7 @@ class FilterState:
         self.yaw_gauge: YawGauge | None = None
         self.last: FrameState | None = None  # newest frame
         self.last_fix_s: float | None = None
-        self.last_seen_s = 0.0  # time of the newest frame with fused odometry or an accepted map match
+        self.last_fused_s = 0.0  # time of the newest frame with fused odometry or an accepted map match
         self.has_height = False
         self.began_s = 0.0
         self.newest_odometry: Odometry | None = None  # as vision published it

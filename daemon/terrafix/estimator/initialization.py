@@ -140,7 +140,7 @@ def continue_from(
         cov[WORLD_POSITION, WORLD_POSITION] += state.yaw_gauge.sigma_share**2 * float(step @ step) * level
     cov[WORLD_ROTATION, WORLD_ROTATION] += np.diag([UNKNOWN_ATTITUDE_RAD, UNKNOWN_ATTITUDE_RAD, UNKNOWN_RAD]) ** 2
     was = state.yaw_gauge or YawGauge(at_m[:2], 0.0)
-    now = was.after_unobserved(dt_s, at_m[:2])
+    now = was.after_gap(dt_s, at_m[:2])
     state.yaw_gauge = now if attitude.yaw_rad is None else None
     rise_m = state.terrain.rise_sigma_m(float(np.hypot(*step)))
     calibration_cov += np.diag(walk_sigmas(dt_s, 0.0, rise_m) ** 2)

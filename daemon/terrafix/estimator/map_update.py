@@ -27,7 +27,8 @@ from terrafix.estimator.measurements.map_pose import (
     levelled_innovation,
 )
 from terrafix.estimator.models.motion_model import unknown_motion_cov
-from terrafix.estimator.propagation import MOTION_TIMEOUT_S, STEP_SHARE
+from terrafix.estimator.propagation import MOTION_TIMEOUT_S
+from terrafix.estimator.registration import STEP_SHARE
 from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import MapMatch, Verdict
 
@@ -196,7 +197,7 @@ class MapUpdate:
         state = self._state
         self._fixes.add(t_s, here_m)
         state.image_jump = None
-        state.last_seen_s = max(state.last_seen_s, t_s)
+        state.last_fused_s = max(state.last_fused_s, t_s)
         state.last_fix_s = self._fixes.newest_s
         self.hypotheses.on_match_accepted()
         self.map_sigma_m = match.map_sigma_m

@@ -64,7 +64,7 @@ class RelocalizationUpdate:
         fusion = fuse(state, node, measurement)
         if fusion.verdict is not Verdict.ACCEPTED:
             return fusion
-        state.last_seen_s = max(state.last_seen_s, state.graph.time_of(node))
+        state.last_fused_s = max(state.last_fused_s, state.graph.time_of(node))
         state.refresh_newest()
         return fusion
 

@@ -188,7 +188,7 @@ class AirspeedAid(AidSource):
         observation = self._observation(sample.t_s, state.graph.state(sample.node), sample.attitude)
         if observation is None:
             return None
-        return AirspeedMeasurement(observation, sample.dt_s, sample.t_s - state.last_seen_s)
+        return AirspeedMeasurement(observation, sample.dt_s, sample.t_s - state.last_fused_s)
 
     def on_fused(self, sample: AidSample, verdict: Verdict) -> None:
         if verdict is not Verdict.ACCEPTED:

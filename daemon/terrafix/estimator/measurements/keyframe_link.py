@@ -16,7 +16,7 @@ NAME = "link"  # in verdicts
 
 
 @dataclass(frozen=True)
-class KeyframeLink:
+class LinkMeasurement:
     """A keyframe that both a frame and its ``parent`` are related to: ``motion`` of the frame since the keyframe, whose
     node is ``keyframe``, and ``known``, its motion since ``parent``."""
 
