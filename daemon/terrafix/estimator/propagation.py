@@ -12,16 +12,15 @@ from terrafix.estimator.aiding import AID_SOURCES
 from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState, ImuQuery
 from terrafix.estimator.graph.pose_graph import NewNode
 from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffDetector, continue_from, start_at
-from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation, ScalarInnovation
+from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
 from terrafix.estimator.integrity.signed_innovations import SignedInnovations
 from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning, DeadReckoningAid
-from terrafix.estimator.measurements.heading import HEADING_GATE_SIGMAS, heading_innovation
+from terrafix.estimator.measurements.heading import heading_innovation
 from terrafix.estimator.measurements.height import (
-    HEIGHT_GATE_SIGMAS,
     height_innovation,
     is_below_map_matching,
     reported_agl_m,
@@ -90,7 +89,7 @@ class Propagation:
         self._take_off = TakeOffDetector()
         self._dead_reckoning = DeadReckoningAid(state)
         self._aids = (self._dead_reckoning, *(make_aid(state) for make_aid in AID_SOURCES))
-        self._height_gate, self._heading_gate = InnovationGate(HEIGHT_GATE_SIGMAS), InnovationGate(HEADING_GATE_SIGMAS)
+        self._height_gate, self._heading_gate = InnovationGate("height"), InnovationGate("attitude")
         self._motion_refused_s: float | None = None  # time of the first of the impossible motions in a row
         self._signed = SignedInnovations()  # of odometry that is fused
 
@@ -375,7 +374,7 @@ class Propagation:
         if fused is None or frame.attitude.yaw_rad is None or frame.attitude.stands or state.yaw_gauge is not None:
             return None
         innovation = heading_innovation(state, frame.attitude, fused.parent, fused.motion.r, before)
-        return self._rejection("attitude", self._heading_gate, innovation)
+        return self._heading_gate.rejection(innovation, state.last_fix_s)
 
     def _gate_height(self, registered: RegisteredFrame) -> FusionVerdict | None:
         """The reported height against the predicted one. -> the verdict on a height that is rejected."""
@@ -384,14 +383,7 @@ class Propagation:
         if attitude.agl_m is None or attitude.stands:
             return None
         innovation = height_innovation(self._state, attitude.agl_m, registered.p_m, predicted.before, climb_m2)
-        return self._rejection("height", self._height_gate, innovation)
-
-    def _rejection(self, name: str, gate: InnovationGate, innovation: ScalarInnovation) -> FusionVerdict | None:
-        """The verdict on a scalar that ``gate`` rejects; None: it is accepted."""
-        residual, sigma = innovation.residual, innovation.sigma
-        if not gate.rejects(residual, sigma, self._state.last_fix_s):
-            return None
-        return FusionVerdict(name, Verdict.IMPLAUSIBLE, Innovation.scalar(residual, sigma, gate.gate_sigmas))
+        return self._height_gate.rejection(innovation, self._state.last_fix_s)
 
     def _is_velocity_wrong(self, odometry: GatedOdometry) -> bool:
         """Whether the innovations of odometry have kept one sign for so long that velocity is what is wrong."""

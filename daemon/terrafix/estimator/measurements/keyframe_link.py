@@ -36,9 +36,7 @@ class LinkMeasurement:
         return Innovation(residual, cov + self.known.cov + self.motion.cov, GATE[6])
 
     def verdict(self, state: FilterState) -> FusionVerdict:
-        innovation = self.innovation(state)
-        verdict = Verdict.ACCEPTED if innovation.is_accepted else Verdict.INNOVATION
-        return FusionVerdict(NAME, verdict, innovation, f"keyframe {self.frame_id}")
+        return self.innovation(state).verdict(NAME, f"keyframe {self.frame_id}")
 
 
 def refused(odometry: Odometry, verdict: Verdict) -> FusionVerdict:

@@ -95,7 +95,7 @@ class OdometryMeasurement:
             motion = self._innovation(t_s, keyframe.translation() + moved_m, answer, before, increment())
             innovation, moves = motion.gated, not motion.allows_standstill
             frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=moves)
-            if frozen or not motion.passes_gate:
+            if frozen or not innovation.is_accepted:
                 verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
                 state.image_jump = None if frozen else (t_s, motion.residual_m[HORIZONTAL])
                 return GatedOdometry(verdict, None, alone, innovation=innovation)
@@ -117,7 +117,7 @@ class OdometryMeasurement:
         """Whether motion and turn of a fragment that is not confirmed are those of this flight."""
         over_s = max(frame.t_s - self._state.graph.time_of(seen.parent), 1e-3)
         heading = heading_innovation(self._state, frame.attitude, seen.parent, seen.motion.r, before)
-        turns_agree = abs(heading.residual) <= HEADING_GATE * heading.sigma
+        turns_agree = heading.mahalanobis2 <= HEADING_GATE**2
         inertial = innovation.inertial and self._state.continuity.inertial_since_fused
         evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree, inertial)
         fragment.add_frame(frame.t_s, evidence)
