@@ -11,12 +11,11 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState, PastFrame
 from terrafix.estimator.graph.pose_graph import GraphPrior
 from terrafix.estimator.initialization import ResetReason, reset
-from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT, AlternativePosition
+from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT
 from terrafix.estimator.integrity.correlated_fixes import CorrelatedFixes
 from terrafix.estimator.integrity.fragments import MapHitRate
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_run import InnovationRun
-from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.map_pose import (
@@ -102,7 +101,7 @@ class MapUpdate:
             return _result(Verdict.DEGENERATE, "2D-3D matches do not determine the pose")
         measurement = MapPoseMeasurement.of(match, state.terrain, state.radial_k1_estimate)
         if match.search.relocalized:  # by a search over several frames: it outweighs whatever the graph has
-            self.hypotheses.other, self.hypotheses.map_consistency = AlternativePosition(), MapConsistency()
+            self.hypotheses.on_relocalized()
             return self._reset(match, self._past(node), measurement, "found")
         if state.yaw_gauge is not None:
             return self._apply_without_heading(match, node, measurement)

@@ -149,7 +149,7 @@ class CorrelationResult:
 
 
 @dataclass(frozen=True)
-class Fix:
+class PatchFix:
     """2D-3D matches of one frame and the pose from them. ``xy`` (N, 2): normalised image coordinates; ``points_w_m``
     (N, 3): map points, local east, north and AMSL height; ``weights`` (N,); ``cell_m``: cell size of the patches;
     ``given``: with which PnP has computed ``pnp``; None: another method has."""
@@ -275,7 +275,7 @@ class FrameMatcher:
             return CorrelationResult(Verdict.OUTSIDE_MAP)
         return CorrelationResult(Verdict.ACCEPTED, tuple(surfaces), tuple(h for h, _ in usable), footprint_m, cell)
 
-    def fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> Fix | None:
+    def fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> PatchFix | None:
         """2D-3D matches around a camera position (local east and north) and the PnP pose. None: the camera sees no
         ground.
 
@@ -290,7 +290,7 @@ class FrameMatcher:
         # lean.
         return self._fix_with(self._describer, image, start)
 
-    def _fix_with(self, describer: Describer, image: Image, view: View) -> Fix | None:
+    def _fix_with(self, describer: Describer, image: Image, view: View) -> PatchFix | None:
         if view.tilt_sigma_rad > KNOWN_TILT_RAD:
             first = self._patch_fix(describer, image, view, FIRST_SEARCH_RADIUS, FIRST_THRESHOLD)
             if first is None or first.pnp.fit is None:
@@ -298,7 +298,7 @@ class FrameMatcher:
             view = levelled_view(view, first)
         return self._patch_fix(describer, image, view, SEARCH_RADIUS, INLIER_THRESHOLD)
 
-    def refine_fix(self, image: Image, view: View, fix: Fix) -> Fix:
+    def refine_fix(self, image: Image, view: View, fix: PatchFix) -> PatchFix:
         """Pose of a place that a search has found, recomputed on the cells of normal tracking; ``fix`` itself if that
         is not accepted."""
         if fix.pnp.fit is None:
@@ -308,7 +308,7 @@ class FrameMatcher:
 
     def _patch_fix(
         self, describer: Describer, image: Image, view: View, radius_share: float, threshold: float
-    ) -> Fix | None:
+    ) -> PatchFix | None:
         gsd = self.cell_m(view.agl_m, FIX_GSD_PER_AGL[describer.name])
         cell = gsd * describer.stride
         image = without_colour(image, describer)
@@ -340,7 +340,7 @@ class FrameMatcher:
             search_radius=radius * cell / view.agl_m,
             min_inliers=PNP_MIN_INLIERS if describer.stride == 1 else LEARNED_INLIERS,
         )
-        return Fix(xy, points, found.weight, solve(points, xy, found.weight, given), cell, given)
+        return PatchFix(xy, points, found.weight, solve(points, xy, found.weight, given), cell, given)
 
     def _next_subset(self, hypotheses: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
         """Subset of the hypotheses that one frame can afford: some of the scales, beginning with the predicted one; the
@@ -369,7 +369,7 @@ def view_at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:
     return replace(view, e_m=e_m, n_m=n_m, r_w_c=r_w_c, agl_m=view.agl_m * hypothesis.scale)
 
 
-def view_of_fix(view: View, fix: Fix) -> View:
+def view_of_fix(view: View, fix: PatchFix) -> View:
     """``view`` with the position, rotation and mean height above ground of the pose of ``fix``, which must have one."""
     assert fix.pnp.fit is not None
     p = fix.pnp.fit.p_c_in_w_m
@@ -377,7 +377,7 @@ def view_of_fix(view: View, fix: Fix) -> View:
     return replace(view, e_m=float(p[0]), n_m=float(p[1]), r_w_c=fix.pnp.fit.r_w_c, agl_m=agl_m)
 
 
-def levelled_view(view: View, fix: Fix) -> View:
+def levelled_view(view: View, fix: PatchFix) -> View:
     """``view_of_fix``, with the tilt that was predicted as a prior. A dozen patches leave the tilt to some degrees, and
     the position to as much of the height: a frame rectified by them alone would be another one for each patch more."""
     assert fix.pnp.fit is not None and fix.given is not None

@@ -5,7 +5,7 @@ A RANSAC pose depends on patches whose own maximum is at the right place. Where 
 these may be too few, while the sum of all patch surfaces still shows where most of the ground is.
 """
 
-from terrafix.anchor.matching.frame_matcher import Fix, FrameMatcher, View
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, PatchFix, View
 from terrafix.anchor.verification.hypothesis_tracker import TRACK_LLR_MAX, evidence
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, PlaceVerifier
@@ -17,7 +17,7 @@ class ConsensusPose:
     def __init__(self, source: LocalMap, matcher: FrameMatcher) -> None:
         self._verifier = PlaceVerifier(source, matcher)
 
-    def estimate(self, image: Image, view: View) -> Fix | None:
+    def estimate(self, image: Image, view: View) -> PatchFix | None:
         """``view``: believed position, yaw and height above ground. None: the evidence is below the largest that one
         frame can give. The default null model is used, because no search has estimated one."""
         first = self._verifier.verify(image, view, CELL_PER_AGL)

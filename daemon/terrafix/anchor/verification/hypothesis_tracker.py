@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import Fix, FrameMatcher, Hypothesis, View
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, PatchFix, View
 from terrafix.anchor.verification.patch_consensus import SCALE_SIGMA, YAW_SIGMA_RAD
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_CELL_PER_AGL, PlaceVerifier
@@ -124,7 +124,7 @@ class PlaceHypothesis:
 @dataclass(frozen=True)
 class AcceptedPlace:
     track: PlaceHypothesis
-    fix: Fix
+    fix: PatchFix
 
 
 class HypothesisTracker:
@@ -188,7 +188,7 @@ class HypothesisTracker:
             ground_m=view.ground_m if up is None or not np.isfinite(up[0]) else float(up[0]),
         )
 
-    def _update_track(self, track: PlaceHypothesis, image: Image, view: View, path_m: float) -> Fix | None:
+    def _update_track(self, track: PlaceHypothesis, image: Image, view: View, path_m: float) -> PatchFix | None:
         """Updates a track with the frame and moves it to the position that fits best. None: no evidence, or no pose."""
         here = self._view_at(track, view)
         is_strong = track.score > 0.0 or track.lead >= LEADING_SIGMAS

@@ -9,8 +9,8 @@ from terrafix.anchor.matching.frame_matcher import (
     FIX_GSD_PER_AGL,
     PATCH_PER_AGL,
     PATCH_STEP,
-    Fix,
     FrameMatcher,
+    PatchFix,
     View,
     view_of_fix,
     without_colour,
@@ -42,7 +42,7 @@ PATCH_SIGMA = 0.005
 @dataclass(frozen=True)
 class VerifiedPlace:
     consensus: PatchConsensus
-    fix: Fix
+    fix: PatchFix
 
 
 class PlaceVerifier:
@@ -97,7 +97,7 @@ class PlaceVerifier:
         found_m = on_map_m + found.offsets * view.agl_m
         return VerifiedPlace(found, self._pose(view, ground_m, found_m, found, cell_m, tilt_sigma_rad))
 
-    def refine(self, image: Image, view: View, first: Fix) -> Fix | None:
+    def refine(self, image: Image, view: View, first: PatchFix) -> PatchFix | None:
         """The pose ``first``, computed from ``view``, refined on the cells of a fix and without a tilt prior: the
         consumer of the pose already uses the predicted tilt."""
         found = self.verify(
@@ -123,7 +123,7 @@ class PlaceVerifier:
         found: PatchConsensus,
         cell_m: float,
         tilt_sigma_rad: float | None,
-    ) -> Fix:
+    ) -> PatchFix:
         rays = np.column_stack([ground_m, np.full(len(ground_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
         up = self._map.elevation(map_m[:, 0], map_m[:, 1])
@@ -146,4 +146,4 @@ class PlaceVerifier:
         if fit is not None:  # weighted with the noise of one patch, reported with the common displacement
             fit = replace(fit, cov=fit.cov * max(SIGMA_FLOOR / fit.sigma, 1.0) ** 2)
         verdict = Verdict.FEW_INLIERS if fit is None else Verdict.ACCEPTED
-        return Fix(xy, points, weights, PnpResult(verdict, fit, found.inliers), cell_m)
+        return PatchFix(xy, points, weights, PnpResult(verdict, fit, found.inliers), cell_m)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import CorrelationResult, Fix, FrameMatcher, View, view_at
+from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher, PatchFix, View, view_at
 from terrafix.anchor.matching.point_mass_filter import Mode
 from terrafix.anchor.verification.hypothesis_tracker import (
     DECISION_MARGIN,
@@ -38,7 +38,7 @@ def localize_single_frame(
     matcher: FrameMatcher,
     null: NullRow,
     log_probability: float,
-) -> tuple[Mode, Fix] | None:
+) -> tuple[Mode, PatchFix] | None:
     """``modes``: of the belief after this frame's correlation. ``null``: null model of the map at this height;
     ``log_probability``: allowed false-alarm probability of this frame. -> the accepted mode with its pose; None: no
     place, or more than one."""
