@@ -23,7 +23,7 @@ from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, View, view_at
 from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
 from terrafix.anchor.matching.match_message import pose_match
-from terrafix.anchor.matching.point_mass_filter import LLR_ZERO_Z, MAX_HALF_CELLS, Belief, Mode, belief_cell_m
+from terrafix.anchor.matching.point_mass_filter import MAX_HALF_CELLS, Belief, Mode, belief_cell_m
 from terrafix.anchor.matching.predicted_view import (
     VAR_E,
     VAR_N,
@@ -44,8 +44,8 @@ from terrafix.anchor.relocalization.relocalizer import (
     search_centre,
     unknown_sigma_m,
 )
+from terrafix.anchor.verification.converged_place import PlaceTest
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
-from terrafix.anchor.verification.place_test import PlaceTest
 from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.gate import SIGMAS_95
@@ -312,7 +312,7 @@ class Localizer:
         match = with_belief(match, belief, modes, score)
         found = self._place_test is not None
         if self._place_test is not None:
-            passed = self._has_passed(self._place_test, modes[0], score, evidence_nats, seen.weight)
+            passed = self._has_passed(self._place_test, modes[0], seen, score, evidence_nats)
             # A position alone does not give a heading that nobody reports.
             if not passed or heading_is_unknown(prediction):
                 return with_step(self._relocalizer.search_match(match), SearchStep.WHOLE_MAP)
@@ -325,14 +325,14 @@ class Localizer:
             pose = self._localize_alone(pose, seen, belief)
         self._lock_monitor.update(evidence_nats, seen.weight, seen.new, pose.inliers, sigma_m, view.agl_m)
         mode_view = view_at(view, hypothesis, pose.mode.e_m, pose.mode.n_m) if pose.attempted else None
-        tested = self._relocalizer.test_frame(image, mode_view)
+        refuted = self._relocalizer.refutes_place(image, mode_view)
         # Mixture "believed position, or anywhere": the variance that the second component adds.
-        wrong = max(self._lock_monitor.wrong_probability, tested)
+        wrong = max(self._lock_monitor.wrong_probability, self._relocalizer.wrong_probability)
         self._relocalizer.sigma_m = mixed_sigma_m(wrong, best.map)
         search = SearchResult(sigma_m=self._relocalizer.sigma_m, relocalized=found)
         match = msgspec.structs.replace(pose.match, search=search)
-        if self._lock_monitor.lost or wrong == 1.0:
-            around_m = prediction.p_c_in_w_m[:2] if tested < 1.0 else None
+        if self._lock_monitor.lost or refuted:
+            around_m = None if refuted else prediction.p_c_in_w_m[:2]
             self._start_search(seen.layer if seen.layer.drawn else best, prediction.agl_m, around_m, LOST_SIGMA_M)
             return self._relocalizer.search_match(match)
         decided = decide(match, pose, belief, seen, score)
@@ -349,11 +349,11 @@ class Localizer:
         return replace(view, scale_sigma=0.0) if matched and is_same_ground else view
 
     @staticmethod
-    def _has_passed(test: PlaceTest, mode: Mode, score: float, evidence_nats: float, weight: float) -> bool:
+    def _has_passed(test: PlaceTest, mode: Mode, seen: Observation, score: float, evidence_nats: float) -> bool:
         """Whether the search of a drawn map ends with this observation, which then is a position-only match."""
-        if score == float(np.float32(LLR_ZERO_Z)):  # nothing is mapped there
+        if not seen.correlation.is_mapped_at(mode.e_m, mode.n_m):
             return False
-        passed = test.update(evidence_nats, weight, dominant=mode.mass >= MIN_POSE_MODE_MASS)
+        passed = test.update(evidence_nats, seen.weight, dominant=mode.mass >= MIN_POSE_MODE_MASS)
         return passed and mode.mass >= MODE_MASS and score >= COARSE_SCORE
 
     def _correlate(self, image: Image, view: View, layers: MapLayers, belief: Belief) -> Observation:

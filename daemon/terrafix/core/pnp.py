@@ -21,7 +21,7 @@ INLIER_THRESHOLD = 0.03
 # precise as least squares to 5 % [spec: biweight, 95 % efficiency]
 CUTOFF = 1.25
 SEARCH_RADIUS = 0.08  # search radius of a patch around its expected place, share of the height [tuned]
-MIN_INLIERS = 8  # fewest inliers of a pose [tuned]
+PNP_MIN_INLIERS = 8  # fewest inliers of a pose [tuned]
 MIN_INLIER_SHARE = 0.35  # smallest share of inliers [tuned]
 # Effective share of independent patches. Neighbours share a third of their error, patches farther apart nothing; with
 # four neighbours 1 in 1 + 4/3 is independent. [measured: docs/monte-carlo.md]
@@ -197,4 +197,4 @@ def _refine(
     q = (points - fit.p_c_in_w_m) @ fit.r_w_c
     error = np.linalg.norm(xy - q[:, :2] / np.maximum(q[:, 2:], 1e-6), axis=1)
     inlier = (error < given.threshold) & (q[:, 2] > 0)
-    return (fit if inlier.sum() >= MIN_INLIERS else None), inlier
+    return (fit if inlier.sum() >= PNP_MIN_INLIERS else None), inlier

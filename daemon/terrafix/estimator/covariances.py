@@ -29,7 +29,7 @@ class Covariances:
         self._graph = graph
         self._rebuilds = 0  # of the graph
         self._propagated: PropagatedCovariance | None = None  # None: marginals
-        self._read: dict[int, np.ndarray] = {}  # node -> marginal of C (6, 6), as it was last read
+        self._recorded: dict[int, np.ndarray] = {}  # node -> marginal of C (6, 6), of ``record``
         self.widening = 1.0
 
     @property
@@ -41,7 +41,7 @@ class Covariances:
         if mode is self.mode:
             return
         if self._propagated is not None:
-            self._read = {node: self.pose(node) for node in self._graph.window}
+            self._recorded = {node: self.pose(node) for node in self._graph.window}
             if not self._graph.window:  # nothing was claimed yet
                 self._propagated = None
                 return
@@ -58,29 +58,33 @@ class Covariances:
         """(6, 6) of C, tangent order."""
         if self._propagated is not None:
             return self._propagated[node][POSE, POSE].copy()
-        self._read[node] = self._graph.covariance(node)
-        return self._read[node]
+        return self._graph.covariance(node)
+
+    def record(self, node: int) -> None:
+        """``recorded_pose`` of ``node`` is the present one: it was added, or a map match of its frame is evaluated."""
+        if self._propagated is None:
+            self._recorded[node] = self._graph.covariance(node)
 
     def _horizontal_sigma_m(self, node: int) -> float:
         """1-sigma along the worst horizontal axis."""
         cov = tangent_to_world(self.pose(node), self._graph.state(node).pose.rotation().matrix())
         return float(np.sqrt(np.linalg.eigvalsh(cov[HORIZONTAL, HORIZONTAL])[-1]))
 
-    def recent_pose(self, node: int) -> np.ndarray:
-        """(6, 6) of C, tangent order, as it was last read: no marginal is computed."""
-        return self._read[node] if self._propagated is None else self.pose(node)
+    def recorded_pose(self, node: int) -> np.ndarray:
+        """(6, 6) of C, tangent order, at the newest ``record``: no marginal is computed."""
+        return self._recorded[node] if self._propagated is None else self.pose(node)
 
-    def velocity(self, node: int) -> np.ndarray:
+    def motion(self, node: int) -> np.ndarray:
         """(8, 8) of V."""
         if self._propagated is not None:
             return self._propagated[node][MOTION, MOTION].copy()
-        return self._graph.velocity_covariance(node)
+        return self._graph.motion_covariance(node)
 
     def calibration(self, node: int) -> np.ndarray:
         """(6, 6) of B."""
         if self._propagated is not None:
             return self._propagated[node][CALIBRATION, CALIBRATION].copy()
-        return self._graph.bias_covariance(node)
+        return self._graph.calibration_covariance(node)
 
     def started(self, node: int, prior: GraphPrior) -> None:
         """A new graph has begun with ``node``."""
@@ -90,13 +94,13 @@ class Covariances:
             self._propagated.begin(node, prior.node_covariance)
             self.measured(node, [] if prior.attitude is None else [prior.attitude])
 
-    def extended(self, new: NewNode, parent: NodeState, walk_sigmas: np.ndarray, velocity_cov: np.ndarray) -> None:
+    def extended(self, new: NewNode, parent: NodeState, walk_sigmas: np.ndarray, motion_cov: np.ndarray) -> None:
         """The newest node is ``new``. ``parent``: of its parent, before; ``walk_sigmas`` (6,): 1-sigma of the change
-        of B since; ``velocity_cov`` (8, 8): of V, where the motion was seen."""
+        of B since; ``motion_cov`` (8, 8): of V, where the motion was seen."""
         window = self._graph.window
         self.widening = max(1.0, (1.0 - NARROWING) * self.widening)
         if self._propagated is None:
-            self._read = {node: cov for node, cov in self._read.items() if node in window}
+            self._recorded = {node: cov for node, cov in self._recorded.items() if node in window}
             return
         if self._restarted():
             return
@@ -105,11 +109,11 @@ class Covariances:
         walk = gtsam.noiseModel.Diagonal.Sigmas(walk_sigmas)
         factors = [ties.odometry, gtsam.BetweenFactorVector(B(new.parent), B(node), np.zeros(CALIBRATION_SIZE), walk)]
         by_increment = new.increment is not None and new.motion.rays is None  # the parent is the node before
-        if by_increment or new.velocity_cov is not None:
+        if by_increment or new.motion_cov is not None:
             factors.append(ties.motion)
         else:
-            known = gtsam.noiseModel.Gaussian.Covariance(velocity_cov)
-            factors.append(gtsam.PriorFactorVector(V(node), new.state.velocity, known))
+            known = gtsam.noiseModel.Gaussian.Covariance(motion_cov)
+            factors.append(gtsam.PriorFactorVector(V(node), new.state.motion, known))
         factors += [] if new.attitude is None else [new.attitude]
         # At the graph's linearization, whose robust weights are those of the estimate: with a stale one it uses less.
         linear = parent if new.parent not in window else self._graph.linearization(new.parent)

@@ -81,14 +81,14 @@ class FrameContinuity:
     ``substitution``: for the keyframe of vision that the graph no longer has. ``last_increment_inertial``: whether the
     last motion increment came from inertial readings; None: there was none. ``stationary_node``: node at which a
     disarmed vehicle stands. ``keyframe_motion``: node of the keyframe of the newest odometry, and the position (3,) of
-    the newest frame in that camera. ``unseen_inertial``: inertial readings have measured all of the motion since the
-    last frame with fused odometry."""
+    the newest frame in that camera. ``inertial_since_fused``: inertial readings have measured all of the motion since
+    the last frame with fused odometry."""
 
     substitution: KeyframeSubstitution | None = None
     last_increment_inertial: bool | None = None
     stationary_node: int | None = None
     keyframe_motion: tuple[int, np.ndarray] | None = None
-    unseen_inertial: bool = True
+    inertial_since_fused: bool = True
 
 
 class FilterState:
@@ -114,14 +114,14 @@ class FilterState:
         self.yaw_gauge: YawGauge | None = None
         self.last: FrameState | None = None  # newest frame
         self.last_fix_s: float | None = None
-        self.last_seen_s = 0.0  # time of the newest frame with fused odometry or an accepted map match
+        self.last_fused_s = 0.0  # time of the newest frame with fused odometry or an accepted map match
         self.has_height = False
         self.began_s = 0.0
         self.newest_odometry: Odometry | None = None  # as vision published it
         # Time of the newest implausible odometry, and (2,) by which it was off the prediction, east and north.
         self.image_jump: tuple[float, np.ndarray] | None = None  # None: none since a match
-        self.velocity_cov = np.zeros((MOTION_SIZE, MOTION_SIZE))  # of V of the newest node
-        self.lens_sigma = radial_k1_sigma(origin.camera)
+        self.motion_cov = np.zeros((MOTION_SIZE, MOTION_SIZE))  # of V of the newest node
+        self.lens_sigma = radial_k1_sigma(origin.camera)  # of its radial coefficient
         self.node_of: dict[int, int] = {}  # frame -> node, for nodes in the window
         self.keyframe_of: dict[int, int] = {}  # node -> frame, of the keyframes among them
         self.frames = array("q")  # frame of each node since the flight began
@@ -140,16 +140,23 @@ class FilterState:
         self.graph.add(*factors)
         self.covariances.measured(node, factors)
 
-    def frame_state(self, frame_id: int, t_s: float, node: int) -> FrameState:
-        """Newest estimate of a frame whose node is in the window."""
-        if node == self.graph.newest:
-            self.velocity_cov = self.covariances.velocity(node)
-            self.lens_sigma = float(np.sqrt(self.covariances.calibration(node)[RADIAL_K1, RADIAL_K1]))
+    def refresh_newest(self) -> FrameState:
+        """To be called after the newest node was added, or factors were: sets ``last``, ``motion_cov`` and
+        ``lens_sigma``. -> ``last``."""
+        node = self.graph.newest
+        self.motion_cov = self.covariances.motion(node)
+        self.lens_sigma = float(np.sqrt(self.covariances.calibration(node)[RADIAL_K1, RADIAL_K1]))
+        self.covariances.record(node)
+        self.last = self.frame_state(node)
+        return self.last
+
+    def frame_state(self, node: int) -> FrameState:
+        """Newest estimate of the frame of a node in the window; the velocity's covariance is that of the newest one."""
         state = self.graph.state(node)
-        velocity, velocity_cov, cov = state.velocity[:3], self.velocity_cov[VELOCITY, VELOCITY], self.covariance(node)
+        velocity, velocity_cov, cov = state.motion[:3], self.motion_cov[VELOCITY, VELOCITY], self.covariance(node)
         if self.yaw_gauge is not None:
             cov, velocity_cov = self.yaw_gauge.marginal_cov(state.pose, cov, velocity, velocity_cov)
-        return FrameState(frame_id, t_s, state.pose, cov, velocity, velocity_cov, node)
+        return FrameState(self.frames[node], self.graph.time_of(node), state.pose, cov, velocity, velocity_cov, node)
 
     def register_frame(self, node: int, frame_id: int, fragment: Fragment) -> None:
         """The newest node belongs to ``frame_id``, in ``fragment``."""
@@ -191,7 +198,9 @@ class FilterState:
     def keep_keyframes(self, leaving: Iterable[int]) -> None:
         """The nodes ``leaving`` are about to leave the window."""
         for node in leaving:
-            past = PastFrame(self.graph.time_of(node), self.graph.state(node).pose, self.covariances.recent_pose(node))
+            past = PastFrame(
+                self.graph.time_of(node), self.graph.state(node).pose, self.covariances.recorded_pose(node)
+            )
             self.left = {f: other for f, other in self.left.items() if past.t_s - other.t_s < LEFT_S}
             self.left[self.frames[node]] = past
             frame_id = self.keyframe_of.get(node)
@@ -206,17 +215,17 @@ class FilterState:
 
     def body(self, frame: FrameState) -> np.ndarray:
         """R_w_b (3, 3) of a frame, with the estimated mount."""
-        return self.camera.body(frame.pose.rotation().matrix(), self.graph.state(frame.node).bias)
+        return self.camera.body(frame.pose.rotation().matrix(), self.graph.state(frame.node).calibration)
 
     def radial_k1(self, node: int) -> float:
         """Coefficient of the radial distortion beyond the camera's description; 0 where it is not significant."""
-        radial_k1 = float(self.graph.state(node).bias[RADIAL_K1])
+        radial_k1 = float(self.graph.state(node).calibration[RADIAL_K1])
         return radial_k1 if abs(radial_k1) > LENS_SURE * self.lens_sigma else 0.0
 
     @property
     def radial_k1_estimate(self) -> tuple[float, float]:
         """Coefficient of the radial distortion beyond the camera's description at the newest node, and its 1-sigma."""
-        return float(self.graph.state(self.graph.newest).bias[RADIAL_K1]), self.lens_sigma
+        return float(self.graph.state(self.graph.newest).calibration[RADIAL_K1]), self.lens_sigma
 
     def height_scale(self, node: int) -> tuple[float, float]:
         """True height over the height in the graph, and its relative 1-sigma: the part of the estimated scale between
@@ -225,7 +234,7 @@ class FilterState:
         if not self.has_height:
             return 1.0, focal
         both = scale_sigma(self.origin.camera)
-        log_scale = float(self.graph.state(node).bias[LOG_HEIGHT_SCALE])
+        log_scale = float(self.graph.state(node).calibration[LOG_HEIGHT_SCALE])
         return focal_scale(self.origin.camera, log_scale), focal * BAROMETER_SCALE_SIGMA / both
 
     def amsl(self, frame: FrameState) -> tuple[float, float]:

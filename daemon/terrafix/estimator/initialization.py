@@ -73,7 +73,7 @@ def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior, *, j
     assert state.newest_odometry is not None
     state.keep_keyframes(state.graph.window)
     state.left.clear()  # the new graph may lie elsewhere
-    state.velocity_cov = prior.velocity_cov
+    state.motion_cov = prior.motion_cov
     node = state.graph.start(t_s, prior)
     state.covariances.started(node, prior)
     state.continuity = FrameContinuity(KeyframeSubstitution.of(state.newest_odometry))
@@ -94,7 +94,7 @@ def start_at(
     origin, attitude = state.origin, frame.attitude
     agl = DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m
     agl_sigma = DEFAULT_AGL_SIGMA_M if attitude.agl_m is None else origin.agl_sigma_m
-    bias, bias_cov = calibration or (np.zeros(CALIBRATION_SIZE), _calibration_prior_cov(state, agl, agl_sigma))
+    bias, calibration_cov = calibration or (np.zeros(CALIBRATION_SIZE), _calibration_prior_cov(state, agl, agl_sigma))
     r_w_c = state.camera.expected(attitude, bias)
     up_m = state.terrain.ground_m + agl
     if origin.ground_amsl_m is not None and attitude.agl_m is not None:  # above the ground of the take-off
@@ -107,9 +107,9 @@ def start_at(
     cov[WORLD_POSITION, WORLD_POSITION] = np.diag([sigma_m, sigma_m, 3 * agl_sigma]) ** 2
     cov[WORLD_ROTATION, WORLD_ROTATION] = np.diag([1.0, 1.0, UNKNOWN_RAD]) ** 2
     state.yaw_gauge = YawGauge(at_m) if attitude.yaw_rad is None else None
-    velocity_cov = stationary_motion_cov() if attitude.stands else unknown_motion_cov()
+    motion_cov = stationary_motion_cov() if attitude.stands else unknown_motion_cov()
     node = NodeState(pose, bias, np.zeros(MOTION_SIZE))
-    return _start(state, frame, node, (cov, bias_cov, velocity_cov), state.terrain.ground_m)
+    return _start(state, frame, node, (cov, calibration_cov, motion_cov), state.terrain.ground_m)
 
 
 def continue_from(
@@ -130,9 +130,9 @@ def continue_from(
     last, attitude = state.last, frame.attitude
     assert last is not None
     dt_s = frame.t_s - last.t_s
-    before, bias_cov = state.graph.state(last.node), state.covariances.calibration(last.node)
+    before, calibration_cov = state.graph.state(last.node), state.covariances.calibration(last.node)
     r_before = before.pose.rotation().matrix()
-    r_w_c = state.camera.expected(attitude, before.bias, r_before)
+    r_w_c = state.camera.expected(attitude, before.calibration, r_before)
     step, level = (at_m - before.pose.translation())[:2], np.diag([1.0, 1.0, 0.0])
     cov = tangent_to_world(last.cov, r_before)
     cov[WORLD_POSITION, WORLD_POSITION] += predicted_cov[DELTA_P, DELTA_P]
@@ -140,14 +140,14 @@ def continue_from(
         cov[WORLD_POSITION, WORLD_POSITION] += state.yaw_gauge.sigma_share**2 * float(step @ step) * level
     cov[WORLD_ROTATION, WORLD_ROTATION] += np.diag([UNKNOWN_ATTITUDE_RAD, UNKNOWN_ATTITUDE_RAD, UNKNOWN_RAD]) ** 2
     was = state.yaw_gauge or YawGauge(at_m[:2], 0.0)
-    now = was.after_unobserved(dt_s, at_m[:2])
+    now = was.after_gap(dt_s, at_m[:2])
     state.yaw_gauge = now if attitude.yaw_rad is None else None
     rise_m = state.terrain.rise_sigma_m(float(np.hypot(*step)))
-    bias_cov += np.diag(walk_sigmas(dt_s, 0.0, rise_m) ** 2)
-    velocity_cov = predicted_cov[DELTA_MOTION, DELTA_MOTION].copy()
-    velocity_cov[VELOCITY, VELOCITY] += now.sigma_share**2 * float(velocity[:2] @ velocity[:2]) * level
-    node = NodeState(gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), at_m), before.bias, velocity)
-    covs = cov, bias_cov, velocity_cov
+    calibration_cov += np.diag(walk_sigmas(dt_s, 0.0, rise_m) ** 2)
+    motion_cov = predicted_cov[DELTA_MOTION, DELTA_MOTION].copy()
+    motion_cov[VELOCITY, VELOCITY] += now.sigma_share**2 * float(velocity[:2] @ velocity[:2]) * level
+    node = NodeState(gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), at_m), before.calibration, velocity)
+    covs = cov, calibration_cov, motion_cov
     return _start(state, frame, node, covs, state.terrain.elevation_m(at_m), joined=joined)
 
 
@@ -162,20 +162,19 @@ def _start(
 ) -> FrameState:
     """A new graph with the reported attitude and height. ``covs``: of the pose (6, 6) in world axes, of B (6, 6) and of
     V (8, 8). ``ground_m``: AMSL, below the camera. ``joined``: as in ``reset``."""
-    cov, bias_cov, velocity_cov = covs
+    cov, calibration_cov, motion_cov = covs
     r_w_c = first.pose.rotation().matrix()
     gauge = state.yaw_gauge
     prior = GraphPrior(
         first,
         world_to_tangent(cov, r_w_c),
-        bias_cov,
-        velocity_cov,
+        calibration_cov,
+        motion_cov,
         state.camera.factor(state.graph.next_keys(), frame.attitude, r_w_c, ground_m),
         world_to_tangent(cov if gauge is None else gauge.gauge_fixed_cov(cov), r_w_c),
     )
-    node = reset(state, frame.frame_id, frame.t_s, prior, joined=joined)
-    state.last = state.frame_state(frame.frame_id, frame.t_s, node)
-    return state.last
+    reset(state, frame.frame_id, frame.t_s, prior, joined=joined)
+    return state.refresh_newest()
 
 
 def _calibration_prior_cov(state: FilterState, agl_m: float, agl_sigma_m: float) -> np.ndarray:

@@ -8,15 +8,14 @@ import numpy as np
 
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.core.pose import tangent_to_world
-from terrafix.estimator.filter_state import FilterState, FrameState, PastFrame
+from terrafix.estimator.filter_state import FilterState, PastFrame
 from terrafix.estimator.graph.pose_graph import GraphPrior
 from terrafix.estimator.initialization import ResetReason, reset
-from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT, AlternativePosition
+from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT
 from terrafix.estimator.integrity.correlated_fixes import CorrelatedFixes
 from terrafix.estimator.integrity.fragments import MapHitRate
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_run import InnovationRun
-from terrafix.estimator.integrity.map_consistency import MapConsistency
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.map_pose import (
@@ -27,7 +26,8 @@ from terrafix.estimator.measurements.map_pose import (
     levelled_innovation,
 )
 from terrafix.estimator.models.motion_model import unknown_motion_cov
-from terrafix.estimator.propagation import MOTION_TIMEOUT_S, STEP_SHARE
+from terrafix.estimator.propagation import MOTION_TIMEOUT_S
+from terrafix.estimator.registration import STEP_SHARE
 from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import MapMatch, Verdict
 
@@ -101,7 +101,7 @@ class MapUpdate:
             return _result(Verdict.DEGENERATE, "2D-3D matches do not determine the pose")
         measurement = MapPoseMeasurement.of(match, state.terrain, state.radial_k1_estimate)
         if match.search.relocalized:  # by a search over several frames: it outweighs whatever the graph has
-            self.hypotheses.other, self.hypotheses.map_consistency = AlternativePosition(), MapConsistency()
+            self.hypotheses.on_relocalized()
             return self._reset(match, self._past(node), measurement, "found")
         if state.yaw_gauge is not None:
             return self._apply_without_heading(match, node, measurement)
@@ -118,7 +118,8 @@ class MapUpdate:
         state.terrain.update(match.ground, None if node is None else state.graph.state(node).pose.translation())
         lost = self.hypotheses.on_match(match.verdict, match.search)
         if node is not None and match.belief is not None:
-            frame = self._frame_state(match.frame_id, node)
+            state.covariances.record(node)
+            frame = state.frame_state(node)
             p_m = np.asarray(frame.pose.translation())
             height_m = max(float(p_m[UP]) - state.terrain.ground_m, 1.0)
             cov = tangent_to_world(frame.cov, frame.pose.rotation().matrix())
@@ -129,7 +130,7 @@ class MapUpdate:
         """The first pose that agrees with the position gives the heading."""
         if match.position_only:  # its heading is one of those that were tried
             return _result(Verdict.AMBIGUOUS, "coarse match gives no heading")
-        frame = self._frame_state(match.frame_id, node)
+        frame = self._state.frame_state(node)
         innovation = measurement.position_innovation(frame.pose, frame.cov)
         if not innovation.is_accepted:
             return self._reject(match, node, measurement, innovation)
@@ -175,6 +176,7 @@ class MapUpdate:
             self.hypotheses.map_consistency.add_accepted(share, position)
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
+        state.covariances.record(node)
         return MapResult(replace(fusion, detail=f"information share {share:.2f}"), fixed=fixed)
 
     def _learn_from_pose(self, match: MapMatch, node: int, before: NodeState, measurement: MapPoseMeasurement) -> None:
@@ -194,13 +196,12 @@ class MapUpdate:
         state = self._state
         self._fixes.add(t_s, here_m)
         state.image_jump = None
-        state.last_seen_s = max(state.last_seen_s, t_s)
+        state.last_fused_s = max(state.last_fused_s, t_s)
         state.last_fix_s = self._fixes.newest_s
         self.hypotheses.on_match_accepted()
         self.map_sigma_m = match.map_sigma_m
-        assert state.last is not None
-        state.last = state.frame_state(state.last.frame_id, state.last.t_s, state.graph.newest)
-        state.speed_prior.update_by_map(state.last.t_s, state.last.velocity_mps, state.last.velocity_cov)
+        last = state.refresh_newest()
+        state.speed_prior.update_by_map(last.t_s, last.velocity_mps, last.velocity_cov)
 
     def _reject(self, match: MapMatch, node: int, measurement: MapPoseMeasurement, innovation: Innovation) -> MapResult:
         """Rejected by the gate, unless several matches over new ground agree with each other: then the graph is
@@ -270,17 +271,17 @@ class MapUpdate:
         start_off = self._start_off(position)
         onward = was.pose.between(now.pose)
         cov = self._moved_cov(measurement.cov, onward, now_s - fixed_s)
-        bias = now.bias.copy()
+        bias = now.calibration.copy()
         if match.search.relocalized:  # the ground there lies at another height than the one that was assumed
             bias[HEIGHT] -= float(measurement.pose.translation()[UP] - was.pose.translation()[UP])
-        bias_cov = state.covariances.calibration(state.graph.newest)
-        velocity, velocity_cov = now.velocity, RESTART_INFLATION * state.covariances.velocity(state.graph.newest)
-        velocity_cov[HORIZONTAL, HORIZONTAL] += np.outer(self._rejected.drift_mps, self._rejected.drift_mps)
+        calibration_cov = state.covariances.calibration(state.graph.newest)
+        velocity, motion_cov = now.motion, RESTART_INFLATION * state.covariances.motion(state.graph.newest)
+        motion_cov[HORIZONTAL, HORIZONTAL] += np.outer(self._rejected.drift_mps, self._rejected.drift_mps)
         if state.yaw_gauge is not None:  # it was a velocity in gauge-fixed axes
-            velocity, velocity_cov, state.yaw_gauge = np.zeros(MOTION_SIZE), unknown_motion_cov(), None
+            velocity, motion_cov, state.yaw_gauge = np.zeros(MOTION_SIZE), unknown_motion_cov(), None
         assert state.last is not None
         first = NodeState(measurement.pose.compose(onward), bias, velocity)
-        reset(state, state.last.frame_id, now_s, GraphPrior(first, cov, bias_cov, velocity_cov))
+        reset(state, state.last.frame_id, now_s, GraphPrior(first, cov, calibration_cov, motion_cov))
         if not position.is_accepted:  # what led to the wrong estimate is in the kept keyframes, too
             state.keyframes.clear()
         self._rejected.clear()
@@ -298,11 +299,11 @@ class MapUpdate:
         around the estimate of then, and would contradict what follows from the new one: heights went off by a sixth."""
         state, newest = self._state, self._state.graph.newest
         assert state.last is not None
-        covs = state.covariance(newest), state.covariances.calibration(newest), state.covariances.velocity(newest)
-        cov, bias_cov, velocity_cov = (RESTART_INFLATION * one for one in covs)
-        prior = GraphPrior(state.graph.state(newest), cov, bias_cov, velocity_cov)
+        covs = state.covariance(newest), state.covariances.calibration(newest), state.covariances.motion(newest)
+        cov, calibration_cov, motion_cov = (RESTART_INFLATION * one for one in covs)
+        prior = GraphPrior(state.graph.state(newest), cov, calibration_cov, motion_cov)
         reset(state, state.last.frame_id, state.graph.time_of(newest), prior)
-        state.last = state.frame_state(state.last.frame_id, state.last.t_s, state.graph.newest)
+        state.refresh_newest()
         verdict = FusionVerdict("reset", Verdict.ACCEPTED, None, f"{ResetReason.MAP_MATCH}: found by coarse matches")
         return replace(result, others=(*result.others, verdict))
 
@@ -310,7 +311,7 @@ class MapUpdate:
         """``cov`` (6, 6), tangent order, of a pose, inflated, at the end of the motion ``onward`` of ``dt_s``."""
         moved = onward.inverse().AdjointMap()
         cov = RESTART_INFLATION * moved @ cov @ moved.T
-        velocity_sigma = float(np.sqrt(np.linalg.eigvalsh(self._state.velocity_cov[VELOCITY, VELOCITY])[-1]))
+        velocity_sigma = float(np.sqrt(np.linalg.eigvalsh(self._state.motion_cov[VELOCITY, VELOCITY])[-1]))
         way_m = float(np.linalg.norm(onward.translation()))
         cov[TRANSLATION, TRANSLATION] += np.hypot(STEP_SHARE * way_m, velocity_sigma * dt_s) ** 2 * np.eye(3)
         return cov
@@ -327,9 +328,6 @@ class MapUpdate:
     def _height_m(self, measurement: MapPoseMeasurement) -> float:
         """Above the ground, 1 m at least."""
         return max(float(measurement.pose.translation()[UP]) - self._state.terrain.ground_m, 1.0)
-
-    def _frame_state(self, frame_id: int, node: int) -> FrameState:
-        return self._state.frame_state(frame_id, self._state.graph.time_of(node), node)
 
 
 def _place_mass(match: MapMatch) -> float:

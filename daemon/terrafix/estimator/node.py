@@ -7,7 +7,6 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
 from terrafix.core.node import Edge, NodeContext
@@ -35,7 +34,6 @@ from terrafix.estimator.output import (
 from terrafix.estimator.pose_estimator import (
     EstimatedFlight,
     OpenCVGtsamPoseEstimator,
-    PnpFailureError,
     PoseEstimator,
     covariance_mode,
 )
@@ -94,8 +92,7 @@ class EstimatorNode:
         self._first_frame_id = 0  # of the flight from the newest InitialPosition
         self._estimator: Estimator | None = None
         self._axes: LocalFrame | None = None
-        self._flight: EstimatedFlight | None = None  # of the newest estimator ...
-        self._poses: PoseEstimator | None = None  # ... and what adds map matches to it
+        self._flight: EstimatedFlight | None = None  # of the newest estimator
         self._telemetry = Telemetry()
         self._camera_vehicle = CameraVehicleTest(None if checkpoint is None else checkpoint.camera_vehicle)
         sent_ns = None if checkpoint is None else checkpoint.estimate.t_ns
@@ -199,8 +196,6 @@ class EstimatorNode:
         assert self._axes is not None and self._monitors is not None
         self._estimator = estimator
         self._flight = EstimatedFlight(estimator, self._axes, time_offset, self._monitors, self._telemetry)
-        # Without a warning for each estimate: Health and NavEstimate state the mode.
-        self._poses = OpenCVGtsamPoseEstimator(self._flight, warn=lambda _: None)
         return estimator
 
     def _prior(self, origin: Origin, axes: LocalFrame) -> NavPrior | None:
@@ -410,17 +405,14 @@ class EstimatorNode:
     # --- map matches ---------------------------------------------------------------------------------------------
 
     def _on_map_match(self, match: MapMatch) -> Iterable[Message]:
-        estimator, poses = self._estimator, self._poses
-        if estimator is None or poses is None:
+        estimator, flight = self._estimator, self._flight
+        if estimator is None or flight is None:
             return
         if match.frame_id < self._first_frame_id:  # of ground and belief before the InitialPosition
             yield verdict_of(match.t_ns, match.frame_id, FusionVerdict("map", Verdict.STALE))
             return
         was_multimodal = estimator.hypotheses.is_multimodal
-        try:
-            outcome = poses.estimate(match, CameraCalibration.of(estimator.origin.camera), self._thermal).outcome
-        except PnpFailureError as failure:
-            outcome = failure.outcome
+        outcome = flight.fuse(match, self.mode)
         result = outcome.result
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
         fragment = estimator.state.fragment_of(match.frame_id)

@@ -129,8 +129,8 @@ def _source(age_ms: int, *, tracked: bool) -> SourceLabel:
 
 def calibration_of(estimator: Estimator, frame: FrameState) -> CalibrationEstimate:
     """The calibration state of ``frame``, the newest one."""
-    bias = estimator.graph.state(frame.node).bias
-    cov = estimator.graph.bias_covariance(frame.node)
+    bias = estimator.graph.state(frame.node).calibration
+    cov = estimator.graph.calibration_covariance(frame.node)
     tilt_x, tilt_y, heading, height, radial_k1, scale = (float(e) for e in bias)
     return CalibrationEstimate(
         t_ns=round(frame.t_s * 1e9),

@@ -10,11 +10,11 @@ import numpy as np
 
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, method_of, solved
+from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, SEARCH_RADIUS, method_of, solved
 from terrafix.core.pose import project_with_jacobian
 from terrafix.estimator.claim import Claim, claim
 from terrafix.estimator.estimator import Estimator
-from terrafix.estimator.filter_state import FrameState
+from terrafix.estimator.filter_state import FilterState, FrameState
 from terrafix.estimator.integrity.time_offset import TimeOffset
 from terrafix.estimator.map_update import MapResult
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
@@ -37,6 +37,14 @@ MatchResult = MapMatch  # 2D-3D matches of a frame, or the camera pose that the 
 ThermalState = Health
 
 
+@dataclass(frozen=True)
+class MatchOutcome:
+    """What was done with a match: the pose that was computed, and the result of the gate and the graph."""
+
+    solution: PoseSolution
+    result: MapResult
+
+
 @dataclass
 class EstimatedFlight:
     """The estimator of a flight and what its estimates are published with. ``axes``: of its local frame;
@@ -51,13 +59,15 @@ class EstimatedFlight:
     def claim(self, frame: FrameState) -> Claim:
         return claim(self.estimator, frame, self.time_offset.sigma_s, self.monitors.sigma_m)
 
-
-@dataclass(frozen=True)
-class MatchOutcome:
-    """What was done with a match: the pose that was computed, and the result of the gate and the graph."""
-
-    solution: PoseSolution
-    result: MapResult
+    def fuse(self, match: MatchResult, mode: CovarianceMode) -> MatchOutcome:
+        """Solves ``match``, gates its pose and adds it to the graph. A rejected match is a verdict in the result."""
+        state, camera = self.estimator.state, CameraCalibration.of(self.estimator.origin.camera)
+        state.covariances.set_mode(mode)
+        given = _with_pnp_input(match, camera, state)
+        found = solved(given)  # by the same function as in the anchor, which sends no pose (decision 037)
+        result = self.estimator.feed_map_match(found)
+        self.monitors.on_map_match(found, self.telemetry, accepted=result.verdict is Verdict.ACCEPTED)
+        return MatchOutcome(_solution(given, found, camera, result, state.mode), result)
 
 
 class PnpFailureError(Exception):
@@ -110,78 +120,27 @@ class OpenCVGtsamPoseEstimator:
     """PnP by OpenCV (core/pnp.py), fusion by the GTSAM graph of ``flight``, which receives the frames and their
     odometry from EstimatorNode."""
 
-    def __init__(
-        self,
-        flight: EstimatedFlight,
-        clock: Callable[[], int] | None = None,
-        warn: Callable[[Warning], object] = warnings.warn,
-    ) -> None:
-        """``clock``: monotonic time [ns] for ``emitted_at``; None: the time of the newest measurement, as in a replay.
-        ``warn``: receives CovarianceDegradedWarning."""
-        self.flight, self._clock, self._warn = flight, clock, warn
+    def __init__(self, flight: EstimatedFlight, clock: Callable[[], int] | None = None) -> None:
+        """``clock``: monotonic time [ns] for ``emitted_at``; None: the time of the newest measurement, as in a
+        replay."""
+        self.flight, self._clock = flight, clock
 
     def current_covariance_mode(self) -> CovarianceMode:
         return self.flight.estimator.state.mode
 
     def estimate(self, match: MatchResult, camera: CameraCalibration, thermal: ThermalState) -> PoseEstimate:
-        flight, estimator = self.flight, self.flight.estimator
-        if camera != CameraCalibration.of(estimator.origin.camera):
+        flight, state = self.flight, self.flight.estimator.state
+        if camera != CameraCalibration.of(state.origin.camera):
             raise ValueError("the camera is not the one that Origin named: give CameraCalibration.of(origin.camera)")
-        estimator.state.covariances.set_mode(covariance_mode(thermal))
-        given = self._with_pnp_input(match, camera)
-        found = solved(given)
-        result = estimator.feed_map_match(found)
-        outcome = MatchOutcome(self._solution(given, found, camera, result), result)
-        accepted = result.verdict is Verdict.ACCEPTED
-        flight.monitors.on_map_match(found, flight.telemetry, accepted=accepted)
-        if not accepted:
+        outcome = flight.fuse(match, covariance_mode(thermal))
+        if outcome.result.verdict is not Verdict.ACCEPTED:
             raise PnpFailureError(outcome)
-        if estimator.state.mode is CovarianceMode.JACOBIAN:
-            self._warn(CovarianceDegradedWarning(f"propagated covariance: {thermal.cause}"))
-        return self._estimate(self._frame_of(match), outcome)
-
-    def _with_pnp_input(self, match: MatchResult, camera: CameraCalibration) -> MatchResult:
-        """``match``; where its matcher states neither a pose nor the input of PnP, with that of the graph and of
-        matches that are good to a pixel."""
-        state = self.flight.estimator.state
-        node = state.node_of.get(match.frame_id)
-        if not match.matches or match.pnp or match.pose or node is None or not state.graph.holds(node):
-            return match
-        pose = state.graph.state(node).pose
-        p = pose.translation()
-        given = PnpInput(
-            q_w_c=quat_from_rot(pose.rotation().matrix()),
-            agl_m=max(state.terrain.height_above_m(p), MIN_AGL_M),
-            sigma_floor=1.0 / camera.fx,
-            threshold=INLIER_THRESHOLD,
-            search_radius=SEARCH_RADIUS,
-            min_inliers=MIN_INLIERS,
-        )
-        return msgspec.structs.replace(match, pnp=given)
-
-    def _solution(
-        self, given: MatchResult, found: MatchResult, camera: CameraCalibration, result: MapResult
-    ) -> PoseSolution:
-        """``found``: ``given``, solved; ``result``: of ``found``."""
-        degenerate = result.verdict is Verdict.DEGENERATE
-        return PoseSolution(
-            t_ns=found.t_ns,
-            frame_id=found.frame_id,
-            verdict=result.verdict if degenerate else found.verdict,
-            method=method_of(given),
-            inliers=found.inliers,
-            residual_px=None if degenerate else _residual_px(found, camera),
-            covariance_mode=self.current_covariance_mode(),
-            pose=None if degenerate else found.pose,
-        )
-
-    def _frame_of(self, match: MatchResult) -> FrameState:
-        state = self.flight.estimator.state
+        if state.mode is CovarianceMode.JACOBIAN:
+            warnings.warn(CovarianceDegradedWarning(f"propagated covariance: {thermal.cause}"), stacklevel=2)
         node = state.node_of.get(match.frame_id)
         assert state.last is not None
-        if node is None or not state.graph.holds(node) or node == state.last.node:
-            return state.last
-        return state.frame_state(match.frame_id, state.graph.time_of(node), node)
+        in_window = node is not None and state.graph.holds(node)
+        return self._estimate(state.frame_state(node) if node is not None and in_window else state.last, outcome)
 
     def _estimate(self, frame: FrameState, outcome: MatchOutcome) -> PoseEstimate:
         flight = self.flight
@@ -204,6 +163,41 @@ class OpenCVGtsamPoseEstimator:
 def covariance_mode(thermal: ThermalState) -> CovarianceMode:
     """JACOBIAN in any thermal band but the normal one (ON-2)."""
     return CovarianceMode.MARGINALS if thermal.band is ThermalBand.NORMAL else CovarianceMode.JACOBIAN
+
+
+def _with_pnp_input(match: MatchResult, camera: CameraCalibration, state: FilterState) -> MatchResult:
+    """``match``; where its matcher states neither a pose nor the input of PnP, with that of the graph and of matches
+    that are good to a pixel."""
+    node = state.node_of.get(match.frame_id)
+    if not match.matches or match.pnp or match.pose or node is None or not state.graph.holds(node):
+        return match
+    pose = state.graph.state(node).pose
+    given = PnpInput(
+        q_w_c=quat_from_rot(pose.rotation().matrix()),
+        agl_m=max(state.terrain.height_above_m(pose.translation()), MIN_AGL_M),
+        sigma_floor=1.0 / camera.fx,
+        threshold=INLIER_THRESHOLD,
+        search_radius=SEARCH_RADIUS,
+        min_inliers=PNP_MIN_INLIERS,
+    )
+    return msgspec.structs.replace(match, pnp=given)
+
+
+def _solution(
+    given: MatchResult, found: MatchResult, camera: CameraCalibration, result: MapResult, mode: CovarianceMode
+) -> PoseSolution:
+    """``found``: ``given``, solved; ``result``: of ``found``; ``mode``: of the estimate with it."""
+    degenerate = result.verdict is Verdict.DEGENERATE
+    return PoseSolution(
+        t_ns=found.t_ns,
+        frame_id=found.frame_id,
+        verdict=result.verdict if degenerate else found.verdict,
+        method=method_of(given),
+        inliers=found.inliers,
+        residual_px=None if degenerate else _residual_px(found, camera),
+        covariance_mode=mode,
+        pose=None if degenerate else found.pose,
+    )
 
 
 def _residual_px(found: MatchResult, camera: CameraCalibration) -> float | None:

@@ -115,7 +115,7 @@ class NavPrior:
         )
 
     def path_until(self, t_s: float, yaw_rad: float | None) -> tuple[np.ndarray, float]:
-        """-> path (2,) until ``t_s`` without any sighting, and its 1-sigma on each axis. ``yaw_rad``: reported heading
+        """-> path (2,) until ``t_s`` without any odometry, and its 1-sigma on each axis. ``yaw_rad``: reported heading
         at ``t_s``. The change of heading is one turn that may have begun at any moment: mean and spread of the paths
         that this gives."""
         dt_s = t_s - self.t_s

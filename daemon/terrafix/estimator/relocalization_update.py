@@ -1,6 +1,6 @@
 """Relocalisations: gated, confirmed by a second one, and fused."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,24 +50,16 @@ class RelocalizationUpdate:
         if innovation.is_accepted and not self._run.is_confirmed(CONFIRM_FRAMES, 0.0):
             detail = _detail(seen, offset_m)
             return RelocalizationResult(FusionVerdict(measurement.name, Verdict.UNCONFIRMED, innovation, detail))
-        fusion = self._fuse(node, measurement)
-        if fusion.verdict is Verdict.ACCEPTED:
-            self._run.clear()  # it goes on at the corrected estimate: the next one near it needs no other
-            self._run.add(np.zeros(2), here_m, position_only=False)
-            if keyframe.fragment.joined:
-                state.fragments.of(node).join()
-        verdict = FusionVerdict(fusion.measurement, fusion.verdict, fusion.innovation, _detail(seen, offset_m))
-        return RelocalizationResult(verdict, measurement if fusion.verdict is Verdict.ACCEPTED else None)
-
-    def _fuse(self, node: int, measurement: RelocalizationMeasurement) -> FusionVerdict:
-        state = self._state
-        fusion = fuse(state, node, measurement)
+        fusion = replace(fuse(state, node, measurement), detail=_detail(seen, offset_m))
         if fusion.verdict is not Verdict.ACCEPTED:
-            return fusion
-        assert state.last is not None
-        state.last_seen_s = max(state.last_seen_s, state.graph.time_of(node))
-        state.last = state.frame_state(state.last.frame_id, state.last.t_s, state.graph.newest)
-        return fusion
+            return RelocalizationResult(fusion)
+        state.last_fused_s = max(state.last_fused_s, state.graph.time_of(node))
+        state.refresh_newest()
+        self._run.clear()  # it goes on at the corrected estimate: the next one near it needs no other
+        self._run.add(np.zeros(2), here_m, position_only=False)
+        if keyframe.fragment.joined:
+            state.fragments.of(node).join()
+        return RelocalizationResult(fusion, measurement)
 
 
 def _refused(verdict: Verdict, detail: str) -> RelocalizationResult:

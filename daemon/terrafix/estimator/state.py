@@ -48,11 +48,11 @@ class NodeState:
     """Estimate of one node."""
 
     pose: gtsam.Pose3
-    bias: np.ndarray  # (CALIBRATION_SIZE,) B_k
-    velocity: np.ndarray  # (MOTION_SIZE,) V_k
+    calibration: np.ndarray  # (CALIBRATION_SIZE,) B_k
+    motion: np.ndarray  # (MOTION_SIZE,) V_k
 
     @property
     def barometric_up_m(self) -> float:
         """AMSL height in seen units without the height bias. Differs from the height of C where no DEM gives the
         ground and C is a height above whatever ground is seen."""
-        return float(self.pose.translation()[UP] + self.bias[HEIGHT])
+        return float(self.pose.translation()[UP] + self.calibration[HEIGHT])

@@ -17,7 +17,7 @@ from terrafix.link.admission.served_autopilot import AUTOPILOT_COMPONENT, Role
 from terrafix.link.autopilot.autopilot_prior import AutopilotPrior
 from terrafix.link.autopilot.checkpoint import CheckpointWriter
 from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder
-from terrafix.link.autopilot.packet_decoder import AutopilotPeer
+from terrafix.link.autopilot.packet_decoder import PacketDecoder
 from terrafix.link.autopilot.telemetry import candidate_attitude
 from terrafix.link.gnss.previous_source import PreviousSourceFile
 from terrafix.link.gnss.source_switch import SourceSwitch
@@ -101,7 +101,7 @@ class MavlinkEdge:
         self._wall_clock_ns = wall_clock_ns
         self._connection = Connection(config, transport, wall_clock_ns)
         self._timesync = TimeSync()
-        self._autopilot = AutopilotPeer(self._timesync)
+        self._autopilot = PacketDecoder(self._timesync)
         checkpoint = self._checkpoint.restored
         self._admission = Admission(config, is_listening=self._connection.is_listening, checkpoint=checkpoint)
         self._served = self._admission.served

@@ -8,7 +8,7 @@ from terrafix.core import logs
 from terrafix.core.clock import NS_PER_S
 from terrafix.core.config import LinkSection
 from terrafix.link.admission.packet_filter import Admission
-from terrafix.link.autopilot.packet_decoder import AutopilotPeer
+from terrafix.link.autopilot.packet_decoder import PacketDecoder
 from terrafix.link.gnss.source_switch import SourceSwitch
 from terrafix.link.ground_station.links import GroundLinks
 from terrafix.link.mavlink.bandwidth import LinkBandwidth
@@ -31,7 +31,7 @@ class Status:
 
     config: LinkSection
     connection: Connection
-    autopilot: AutopilotPeer
+    autopilot: PacketDecoder
     admission: Admission
     timesync: TimeSync
     streams: Streams

@@ -17,7 +17,6 @@ from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 
 CHUNK_BYTES = 128 * 1024  # largest loss at a kill between two calls of flush(); also the unit of compression
 HEADER_NAME, CALIBRATION_NAME = "terrafix", "terrafix.calibration"  # metadata records
-_END_CHUNK = "_Writer__finalize_chunk"  # mcap ends chunks by size only; flush() calls this private method (tested)
 
 _encoder = msgspec.json.Encoder()
 
@@ -67,8 +66,7 @@ class FlightWriter:
 
     def flush(self) -> None:
         """Passes all data to the operating system, so that kill -9 of this process does not lose it."""
-        getattr(self._mcap, _END_CHUNK)()
-        self._file.flush()
+        self._mcap.flush()  # type: ignore[no-untyped-call]
 
     def sync(self) -> None:
         """Passes what was flushed to the disk, so that a power cut does not lose it. A slow disk takes seconds."""

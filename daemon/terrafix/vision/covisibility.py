@@ -24,7 +24,7 @@ MIN_EPIPOLAR = 20  # of matches on epipolar lines, for that: by chance 14 at mos
 
 
 @dataclass(frozen=True)
-class View:
+class DescribedImage:
     """``features`` of an image, and the strongest ``coarse`` ones, as a copy of COARSE_WIDTH_PX shows them. ``detail``:
     (H, W) uint8, a larger copy of the image; None: there is none."""
 
@@ -42,13 +42,13 @@ class Covisibility:
     ) -> None:
         self._matcher, self._detailed, self._geometry, self._width_px = matcher, detailed, geometry, width_px
 
-    def describe(self, gray: np.ndarray, detail: np.ndarray | None = None) -> View:
-        """(H, W) uint8 -> its view. ``detail``: as in View."""
+    def describe(self, gray: np.ndarray, detail: np.ndarray | None = None) -> DescribedImage:
+        """(H, W) uint8 -> its view. ``detail``: as in DescribedImage."""
         features = self._matcher.describe(gray)
         coarse = features.coarse(min(1.0, COARSE_WIDTH_PX / self._width_px), COARSE_FEATURES)
-        return View(features, coarse, detail)
+        return DescribedImage(features, coarse, detail)
 
-    def links(self, keyframes: Sequence[View], view: View) -> list[tuple[int, TwoView]]:
+    def links(self, keyframes: Sequence[DescribedImage], view: DescribedImage) -> list[tuple[int, TwoView]]:
         """The keyframes of which ``view`` shows ground, as indices, with what both show: at most LINKS, the one with
         most inliers first. The CANDIDATES with most coarse matches are verified, in this order."""
         shared = [self._matcher.shared(keyframe.coarse, view.coarse) for keyframe in keyframes]
@@ -67,7 +67,7 @@ class Covisibility:
                 verified[best] = two_view
         return sorted(verified.items(), key=lambda link: -len(link[1].a_px))
 
-    def _in_detail(self, keyframe: View, view: View, seen: TwoView) -> TwoView | None:
+    def _in_detail(self, keyframe: DescribedImage, view: DescribedImage, seen: TwoView) -> TwoView | None:
         """What both show, by features of larger copies of the parts that ``seen`` matches; None: there are no such
         copies, or it is not enough."""
         if keyframe.detail is None or view.detail is None or len(seen.lines_a_px) < MIN_EPIPOLAR:

@@ -10,7 +10,7 @@ from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.limits import MAX_KEYFRAME_AGE, WINDOW_NODES
 from terrafix.core.node import Image
 from terrafix.messages import Verdict
-from terrafix.vision.covisibility import Covisibility, View
+from terrafix.vision.covisibility import Covisibility, DescribedImage
 from terrafix.vision.features import FeatureMatcher, SiftMatcher
 from terrafix.vision.patch_alignment import align_patches
 from terrafix.vision.two_view import (
@@ -31,7 +31,7 @@ MIN_CORNER_DISTANCE_PX = 12
 KLT_WINDOW_PX = 21
 KLT_LEVELS = 4
 FORWARD_BACKWARD_PX = 1.0  # forward-backward check: larger return error rejects a track (Kalal 2010)
-MIN_INLIERS = 20
+TRACK_MIN_INLIERS = 20
 MIN_INLIER_RATIO = 0.35
 # Median shift for a new keyframe, fraction of the image width: nine tenths still overlap. It moves smoothly and far
 # from frame to frame, where the number of corners that are still tracked falls by a few: as the first to be reached, it
@@ -54,14 +54,14 @@ class _Keyframe:
     corners: np.ndarray  # (N, 2) px
     previous_corners: np.ndarray  # (N, 2) px: the same corners in the previous keyframe; NaN: not observed there
     previous_keyframe_id: int  # frame id of the previous keyframe; meaningless where all of ``previous_corners`` is NaN
-    view: View | None = None  # None: not described yet
+    view: DescribedImage | None = None  # None: not described yet
     age: int = 0
     registered: bool = False  # registered to an earlier keyframe, or a later frame was registered to it
     fragment_id: int = -1
 
 
 @dataclass(frozen=True)
-class Link:
+class KeyframeMatches:
     """Matches with one more keyframe of the fragment. ``two_view``, ``sigma_norm``, ``inliers``, ``tracked``: as in
     Motion."""
 
@@ -93,8 +93,8 @@ class Motion:
     three_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     three_view_sigma_norm: float = 0.0
     fragment_id: int = -1
-    links: tuple[Link, ...] = ()
-    view: View | None = None
+    links: tuple[KeyframeMatches, ...] = ()
+    view: DescribedImage | None = None
 
 
 class FrameTracker:
@@ -142,7 +142,7 @@ class FrameTracker:
             return self._new_fragment(frame_id, gray)
         keyframe.age += 1
         index, points, tracked = self._track_klt(keyframe, gray)
-        enough = len(index) >= max(MIN_INLIERS, MIN_INLIER_RATIO * tracked)
+        enough = len(index) >= max(TRACK_MIN_INLIERS, MIN_INLIER_RATIO * tracked)
         if enough and self._covers_images(keyframe.corners[index], points):
             return self._accept_tracks(keyframe, frame_id, gray, index, points, tracked)
         detail = _gray_copy(image, self._detail_scale) if self._detail_scale > self._scale else None
@@ -186,14 +186,14 @@ class FrameTracker:
         motion = self._build_motion(first, two_view.a_px, two_view.b_px, len(two_view.a_px), two_view.matches, due=True)
         return replace(motion, links=tuple(self._link(k, seen) for k, seen in others), view=current.view)
 
-    def _link(self, keyframe: _Keyframe, seen: TwoView) -> Link:
+    def _link(self, keyframe: _Keyframe, seen: TwoView) -> KeyframeMatches:
         two_view, sigma_norm = self._published(seen.a_px, seen.b_px, len(seen.a_px), seen.matches)
-        return Link(keyframe.frame_id, two_view, sigma_norm, len(seen.a_px), seen.matches)
+        return KeyframeMatches(keyframe.frame_id, two_view, sigma_norm, len(seen.a_px), seen.matches)
 
     def _track_klt(self, keyframe: _Keyframe, gray: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         """KLT from the last tracked frame. -> indices (N,) of the keyframe's corners that agree with one homography,
         their positions (N, 2) px in this frame, and the number of tracked corners."""
-        if self._last_gray is None or len(self._last_points) < MIN_INLIERS:
+        if self._last_gray is None or len(self._last_points) < TRACK_MIN_INLIERS:
             return _NONE, _NO_POINTS, 0
         window = (KLT_WINDOW_PX, KLT_WINDOW_PX)
         start = self._last_points.reshape(-1, 1, 2)
@@ -207,7 +207,7 @@ class FrameTracker:
         keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed
         positions, index = ahead.reshape(-1, 2)[keep], self._last_index[keep]
         inlier = homography_inliers(keyframe.corners[index], positions)
-        if inlier.sum() >= MIN_INLIERS:
+        if inlier.sum() >= TRACK_MIN_INLIERS:
             self._last_points, self._last_index, self._last_gray = positions[inlier], index[inlier], gray
         return index[inlier], positions[inlier], int(keep.sum())
 
@@ -234,7 +234,7 @@ class FrameTracker:
             triples = self._triples(keyframe, aligned, index[valid])
             self._start_keyframe(frame_id, gray, aligned, corners[valid], keyframe.frame_id)
         # Patch alignment fails on a blurred image, but the tracks are still valid.
-        if len(valid) < MIN_INLIERS or not self._covers_images(aligned, aligned):
+        if len(valid) < TRACK_MIN_INLIERS or not self._covers_images(aligned, aligned):
             aligned, valid = points, np.arange(len(points))
         return self._build_motion(keyframe, corners[valid], aligned, len(index), tracked, due=due, triples=triples)
 
@@ -305,7 +305,7 @@ class FrameTracker:
         self._newest_fragment_id += 1
         self._fragment_id = self._newest_fragment_id
 
-    def _new_fragment(self, frame_id: int, gray: np.ndarray, view: View | None = None) -> Motion:
+    def _new_fragment(self, frame_id: int, gray: np.ndarray, view: DescribedImage | None = None) -> Motion:
         """The frame starts a fragment: it has no motion, later frames are registered to it."""
         self._begin_fragment()
         self._start_keyframe(frame_id, gray, view=view)
@@ -319,7 +319,7 @@ class FrameTracker:
         carried: np.ndarray = _NO_POINTS,
         previous_corners: np.ndarray = _NO_POINTS,
         previous_keyframe_id: int = -1,
-        view: View | None = None,
+        view: DescribedImage | None = None,
     ) -> None:
         """The frame becomes the keyframe. Corners ``carried`` (N, 2) px were at ``previous_corners`` (N, 2) in the last
         keyframe; new ones are detected in the areas without corners."""

@@ -22,7 +22,7 @@ CUTOFF, WIDER = 1.25, (5.0, 5.0, 4.0, 3.2, 2.5, 2.0, 1.6)
 # by how much the diagonal of their normal equations is larger, so that points on a line have a solution
 MIN_HOMOGRAPHY, MAX_STEPS, STEP_PX, RIDGE = 8, 20, 1e-4, 1e-9
 MIN_SPREAD = 0.12  # inliers must span this fraction of image width and height, else the pose is not determined
-MIN_INLIERS = 15  # by chance, 4 to 9 of 100 wrong matches agree
+TWO_VIEW_MIN_INLIERS = 15  # by chance, 4 to 9 of 100 wrong matches agree
 MIN_INLIER_RATIO = 0.15
 EPIPOLAR_PX = 1.5  # of a match from its epipolar line [spec: twice the 1-sigma of a feature, feature_tracker.py]
 MAX_ITERATIONS = 3000  # of the search for a motion [spec: five of 30 % right matches are drawn in 99.9 %]
@@ -60,20 +60,20 @@ class TwoViewGeometry:
         return two_view if self.is_verified(two_view) else None
 
     def is_verified(self, two_view: TwoView) -> bool:
-        enough = len(two_view.a_px) >= max(MIN_INLIERS, MIN_INLIER_RATIO * two_view.matches)
+        enough = len(two_view.a_px) >= max(TWO_VIEW_MIN_INLIERS, MIN_INLIER_RATIO * two_view.matches)
         return enough and covers_image(two_view.a_px, self._size_px) and covers_image(two_view.b_px, self._size_px)
 
     def fit(self, matches: Matches) -> TwoView:
         """The matches on one plane, however few these are."""
         a, b = matches.a_px, matches.b_px
-        if len(a) < MIN_INLIERS:
+        if len(a) < TWO_VIEW_MIN_INLIERS:
             return TwoView(a[:0], b[:0], len(matches), a[:0], b[:0])
         x, y = self._camera.normalise(a), self._camera.normalise(b)
         essential, mask = cv2.findEssentialMat(
             x, y, np.eye(3), cv2.USAC_MAGSAC, 0.999, EPIPOLAR_PX / self._camera.fx, MAX_ITERATIONS
         )
         on_lines = np.zeros(len(a), bool) if mask is None else mask.ravel() > 0
-        if on_lines.sum() < MIN_INLIERS:  # points on a plane are on epipolar lines, too
+        if on_lines.sum() < TWO_VIEW_MIN_INLIERS:  # points on a plane are on epipolar lines, too
             return TwoView(a[:0], b[:0], len(matches), a[on_lines], b[on_lines])
         inlier = homography_inliers(a, b)
         if inlier.sum() < PLANAR_SHARE * on_lines.sum():

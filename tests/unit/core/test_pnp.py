@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, PnpResult, solve
+from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, PnpResult, solve
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import PnpInput, Verdict
 from textured_ground import rotation
@@ -32,7 +32,7 @@ GIVEN = PnpInput(
     sigma_floor=SIGMA,
     threshold=INLIER_THRESHOLD,
     search_radius=REACH,
-    min_inliers=MIN_INLIERS,
+    min_inliers=PNP_MIN_INLIERS,
 )
 
 
@@ -121,7 +121,7 @@ def test_the_refined_pose_uses_the_heights_of_near_planar_ground(relief_share: f
     assert np.linalg.norm(plane.fit.p_c_in_w_m - P) > 0.05
 
 
-@pytest.mark.parametrize("count", [0, 3, MIN_INLIERS - 1])
+@pytest.mark.parametrize("count", [0, 3, PNP_MIN_INLIERS - 1])
 def test_few_matches_give_no_pose(count: int) -> None:
     points, xy = scene(np.random.default_rng(1), count, 5.0)
     found = solve_equal_weights(points, xy)

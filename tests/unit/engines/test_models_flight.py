@@ -11,7 +11,7 @@ import tiny_onnx
 from map_matches import position_of
 from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.matching.descriptor_cache import Describer
-from terrafix.anchor.matching.frame_matcher import Fix, FrameMatcher
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, PatchFix
 from terrafix.anchor.model_monitor import MAX_FAILURES
 from terrafix.anchor.node import AnchorNode, make_node
 from terrafix.anchor.relocalization.map_search import MapSearch
@@ -44,7 +44,7 @@ def no_gradient_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     """Patches of gradients give no pose while there is a model."""
     whole = FrameMatcher._fix_with
 
-    def fix_with(self: FrameMatcher, describer: Describer, *seen: Any) -> Fix | None:
+    def fix_with(self: FrameMatcher, describer: Describer, *seen: Any) -> PatchFix | None:
         return None if describer is not self._describer else whole(self, describer, *seen)
 
     monkeypatch.setattr(FrameMatcher, "_fix_with", fix_with)

@@ -97,7 +97,7 @@ def test_under_thermal_throttle_the_published_covariance_is_the_propagated_one()
         estimator, last = newest(run)
         assert np.array_equal(last.cov, estimator.state.covariances.pose(last.node))
         assert not np.array_equal(last.cov, estimator.graph.covariance(last.node))
-        assert np.array_equal(last.velocity_cov, estimator.state.covariances.velocity(last.node)[VELOCITY, VELOCITY])
+        assert np.array_equal(last.velocity_cov, estimator.state.covariances.motion(last.node)[VELOCITY, VELOCITY])
 
 
 def test_propagation_begins_with_the_marginals_of_the_window() -> None:
@@ -106,11 +106,9 @@ def test_propagation_begins_with_the_marginals_of_the_window() -> None:
     state.covariances.set_mode(CovarianceMode.JACOBIAN)
     for node in state.graph.window:
         assert state.covariances.pose(node) == pytest.approx(state.graph.covariance(node), rel=1e-6, abs=1e-12)
-        assert state.covariances.velocity(node) == pytest.approx(
-            state.graph.velocity_covariance(node), rel=1e-6, abs=1e-12
-        )
+        assert state.covariances.motion(node) == pytest.approx(state.graph.motion_covariance(node), rel=1e-6, abs=1e-12)
         assert state.covariances.calibration(node) == pytest.approx(
-            state.graph.bias_covariance(node), rel=1e-6, abs=1e-12
+            state.graph.calibration_covariance(node), rel=1e-6, abs=1e-12
         )
 
 
@@ -122,7 +120,7 @@ def test_a_flight_that_begins_hot_begins_with_the_covariance_of_the_graph() -> N
     state, graph = estimator.state, estimator.graph
     assert state.covariances.pose(last.node) == pytest.approx(graph.covariance(last.node), rel=1e-3, abs=1e-9)
     assert state.covariances.calibration(last.node) == pytest.approx(
-        graph.bias_covariance(last.node), rel=1e-3, abs=1e-9
+        graph.calibration_covariance(last.node), rel=1e-3, abs=1e-9
     )
 
 
@@ -242,7 +240,7 @@ def test_the_first_frame_after_cooling_has_the_marginal_again() -> None:
         estimator, last = newest(run)
         assert run.estimate(i).covariance_mode is CovarianceMode.MARGINALS
         assert np.array_equal(last.cov, estimator.graph.covariance(last.node))
-        assert np.array_equal(last.velocity_cov, estimator.graph.velocity_covariance(last.node)[:3, :3])
+        assert np.array_equal(last.velocity_cov, estimator.graph.motion_covariance(last.node)[:3, :3])
 
 
 def test_where_marginals_return_the_claim_does_not_step_and_narrows_by_a_twentieth_a_frame() -> None:
@@ -254,9 +252,9 @@ def test_where_marginals_return_the_claim_does_not_step_and_narrows_by_a_twentie
     covariances = estimator.state.covariances
     assert covariances._propagated is not None
     covariances._propagated.begin(last.node, 3.0 * estimator.graph.joint_covariance(last.node))
-    hot = claim(estimator, estimator.state.frame_state(last.frame_id, last.t_s, last.node), 0.0, 0.0)
+    hot = claim(estimator, estimator.state.frame_state(last.node), 0.0, 0.0)
     covariances.set_mode(CovarianceMode.MARGINALS)
-    cool = claim(estimator, estimator.state.frame_state(last.frame_id, last.t_s, last.node), 0.0, 0.0)
+    cool = claim(estimator, estimator.state.frame_state(last.node), 0.0, 0.0)
     assert covariances.widening == pytest.approx(3.0**0.5)
     assert cool.terms_m2["graph"] == pytest.approx(hot.terms_m2["graph"])
     run.feed([health(ThermalBand.NORMAL)])

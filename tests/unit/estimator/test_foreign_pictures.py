@@ -164,7 +164,7 @@ def test_the_prediction_of_an_unjoined_fragment_covers_the_time_since_its_keyfra
         state = odometry._state
         if not state.fragments.of(seen.parent).confirmed:
             since_s = t_s - state.graph.time_of(seen.parent)
-            velocity_m2 = state.velocity_cov[:2, :2] * since_s**2
+            velocity_m2 = state.motion_cov[:2, :2] * since_s**2
             beyond.append(float(np.linalg.eigvalsh(innovation.cov_m2[:2, :2] - velocity_m2)[0]))
         return innovation
 

@@ -45,8 +45,8 @@ def flown(focal: float, *, dem: bool, seed: int) -> tuple[Flight, EstimatorRun]:
 def estimated(run: EstimatorRun) -> tuple[float, float]:
     assert run.node.estimator is not None
     graph = run.node.estimator.graph
-    cov = graph.bias_covariance(graph.newest)
-    return float(graph.state(graph.newest).bias[LOG_HEIGHT_SCALE]), float(
+    cov = graph.calibration_covariance(graph.newest)
+    return float(graph.state(graph.newest).calibration[LOG_HEIGHT_SCALE]), float(
         np.sqrt(cov[LOG_HEIGHT_SCALE, LOG_HEIGHT_SCALE])
     )
 
@@ -84,7 +84,7 @@ def test_the_height_scale_is_divided_between_focal_length_and_barometer_by_varia
         estimator = run.node.estimator
         assert estimator is not None
         state = estimator.graph.state(0)
-        state.bias[LOG_HEIGHT_SCALE] = np.log(0.8)
+        state.calibration[LOG_HEIGHT_SCALE] = np.log(0.8)
         stretch, sigma = estimator.state.height_scale(0)
         assert stretch == pytest.approx(0.8**share, rel=1e-3)
         assert sigma == pytest.approx((focal_sigma**-2 + BAROMETER_SCALE_SIGMA**-2) ** -0.5)

@@ -86,7 +86,7 @@ def test_the_radial_coefficient_is_estimated_in_flight_and_stays_zero_without_di
         run.feed(map(with_distortion, messages))
     assert run.node.estimator is not None
     graph = run.node.estimator.graph
-    estimate = float(graph.state(graph.newest).bias[RADIAL_K1])
-    sigma = float(np.sqrt(graph.bias_covariance(graph.newest)[RADIAL_K1, RADIAL_K1]))
+    estimate = float(graph.state(graph.newest).calibration[RADIAL_K1])
+    sigma = float(np.sqrt(graph.calibration_covariance(graph.newest)[RADIAL_K1, RADIAL_K1]))
     assert sigma < 0.5 * RADIAL_K1_SIGMA
     assert abs(estimate - k1) < 2.5 * sigma

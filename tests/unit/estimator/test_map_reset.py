@@ -59,7 +59,7 @@ def test_a_match_that_comes_late_has_the_error_of_the_motion_since_then(
     match = found(flight, frame)
     measured = MapPoseMeasurement.of(match, estimator.terrain, state.radial_k1_estimate)
     onward = state.graph.state(node).pose.between(last.pose)
-    velocity_sigma = np.sqrt(np.linalg.eigvalsh(state.velocity_cov[VELOCITY, VELOCITY])[-1])
+    velocity_sigma = np.sqrt(np.linalg.eigvalsh(state.motion_cov[VELOCITY, VELOCITY])[-1])
     dt_s = last.t_s - state.graph.time_of(node)
     run.feed([match])
     moved = onward.inverse().AdjointMap()

@@ -14,7 +14,7 @@ from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of
 from smoother_marginals import recorded_marginals
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, PLANAR_RELIEF, SEARCH_RADIUS, solved
+from terrafix.core.pnp import INLIER_THRESHOLD, PLANAR_RELIEF, PNP_MIN_INLIERS, SEARCH_RADIUS, solved
 from terrafix.core.pose import exp_so3
 from terrafix.estimator import (
     CovarianceDegradedWarning,
@@ -79,7 +79,7 @@ def match_of(flight: Flight, i: int = AT, matches: np.ndarray | None = None, **p
         sigma_floor=PIXEL,
         threshold=INLIER_THRESHOLD,
         search_radius=SEARCH_RADIUS,
-        min_inliers=MIN_INLIERS,
+        min_inliers=PNP_MIN_INLIERS,
     )
     rows = (seen(flight, i, below(flight, i)) if matches is None else matches).tolist()
     return msgspec.structs.replace(

@@ -5,7 +5,7 @@ import pytest
 
 from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.vision.features import Features, Matches, SiftMatcher, mutual_nearest
-from terrafix.vision.two_view import MIN_INLIERS, TwoViewGeometry
+from terrafix.vision.two_view import TWO_VIEW_MIN_INLIERS, TwoViewGeometry
 
 CAMERA = CameraCalibration(720, 405, 524.0, 524.0, 359.5, 202.0)
 AGL_M = 120.0
@@ -100,7 +100,7 @@ def test_wrong_matches_have_no_motion(seed: int) -> None:
     a, b = (rng.uniform((0, 0), (720, 405), (90, 2)).astype(np.float32) for _ in range(2))
     geometry, zero = TwoViewGeometry(CAMERA), np.zeros(90, np.float32)
     assert geometry.verify(Matches(a, b, zero, zero)) is None
-    assert len(geometry.fit(Matches(a, b, zero, zero)).a_px) < MIN_INLIERS
+    assert len(geometry.fit(Matches(a, b, zero, zero)).a_px) < TWO_VIEW_MIN_INLIERS
 
 
 def test_matches_in_a_corner_of_the_image_determine_no_motion() -> None:

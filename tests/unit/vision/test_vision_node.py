@@ -7,7 +7,7 @@ from origins import origin_of
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import Camera, Frame, KeyframeLink, Odometry, Origin, Verdict
-from terrafix.vision.feature_tracker import FrameTracker, Link, Motion
+from terrafix.vision.feature_tracker import FrameTracker, KeyframeMatches, Motion
 from terrafix.vision.node import VisionNode
 from terrafix.vision.relocalization import RelocalizationSearch
 
@@ -81,7 +81,7 @@ def test_three_view_matches_and_links_carry_the_ids_of_their_keyframes() -> None
     node = VisionNode(store)
     list(node.on(ORIGIN))
     seen = np.arange(6.0).reshape(1, 6)
-    links = (Link(1, seen[:, 2:], 0.003, 20, 25),)
+    links = (KeyframeMatches(1, seen[:, 2:], 0.003, 20, 25),)
     motion = Motion(4, Verdict.ACCEPTED, seen[:, :4], 0.001, 30, 40, True, 2, seen, 0.002, fragment_id=3, links=links)
     camera = CameraCalibration.of(ORIGIN.camera)
     node._tracker, node._search = FrameTracker(camera), RelocalizationSearch(camera)

@@ -155,8 +155,8 @@ class _Smoothing:
         values = gtsam.Values()
         for i, state in enumerate(placed_states(self._flight)):
             values.insert(C(i), state.pose)
-            values.insert(B(i), state.bias)
-            values.insert(V(i), state.velocity)
+            values.insert(B(i), state.calibration)
+            values.insert(V(i), state.motion)
         for j in range(len(self._maps)):
             values.insert(M(j), gtsam.Pose3())
         values.insert(F(0), np.zeros(1))

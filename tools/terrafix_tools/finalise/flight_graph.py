@@ -122,7 +122,7 @@ class GraphRecorder(GraphObserver):
             self.nodes.append(RecordedNode(t_s, prior.state, _same_frame(node - 1, node), graph.newest, again=True))
         else:
             kept = [f for f in others if list(f.keys()) != [B(node)]]
-            calibration = prior.state.bias, prior.bias_cov
+            calibration = prior.state.calibration, prior.calibration_cov
             pose = prior.state.pose, prior.cov
             self.nodes.append(RecordedNode(t_s, prior.state, kept, prior=pose, calibration=calibration))
 
@@ -135,7 +135,7 @@ class GraphRecorder(GraphObserver):
         others: list[gtsam.NonlinearFactor],
     ) -> None:
         # The smoother makes its own odometry factor of rays.
-        if new.increment is not None and new.velocity_cov is None:  # others[0] is that of the increment
+        if new.increment is not None and new.motion_cov is None:  # others[0] is that of the increment
             n, last = graph.next_node, graph.newest
             keys = (C(last), V(last)), (C(n), V(n)), (B(last), B(n))
             others = [motion_factor(*keys, new.increment, new.state.pose.rotation(), FocalKey(F(0), 0.0)), *others[1:]]

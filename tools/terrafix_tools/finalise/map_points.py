@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from terrafix.core.geodesy import rot_from_quat
-from terrafix.core.pnp import INDEPENDENT_SHARE, MIN_INLIERS, outlier_inflation, random_inlier_probability
+from terrafix.core.pnp import INDEPENDENT_SHARE, PNP_MIN_INLIERS, outlier_inflation, random_inlier_probability
 from terrafix.core.pose import HUBER_K, exp_so3, fit_pose, project_with_jacobian
 from terrafix.estimator.factors.noise import whiten_common
 from terrafix.estimator.measurements.map_pose import LOCAL_WARP, ROOFS
@@ -90,7 +90,7 @@ class MatchedPoints:
         that agree are too few, or do not determine a pose."""
         rays = lens.rays(self.xy)
         r_w_c, p_m, inliers = self._agreeing(rays, lens)
-        if inliers.sum() < MIN_INLIERS:
+        if inliers.sum() < PNP_MIN_INLIERS:
             return None
         found = fit_pose(
             self.points_m[inliers], rays[inliers], r_w_c, p_m, self.given.sigma_floor, self.weights[inliers]

@@ -203,7 +203,7 @@ def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, Placed
         state = flight.recorder.nodes[node].state
         r, cov = state.pose.rotation().matrix(), np.zeros((POSE_SIZE, POSE_SIZE))
         cov[TRANSLATION, TRANSLATION] = r.T @ (cov_m2 + np.diag([map_var, map_var, 0.0])) @ r
-        placed[frame_id] = Placed(gtsam.Pose3(state.pose.rotation(), p_m), cov, state.bias)
+        placed[frame_id] = Placed(gtsam.Pose3(state.pose.rotation(), p_m), cov, state.calibration)
     return placed
 
 

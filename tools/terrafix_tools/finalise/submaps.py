@@ -80,6 +80,6 @@ def _submap(nodes: list[RecordedNode], first: int, scale_sigma: float | None) ->
 
 def _moved(state: NodeState, pose: gtsam.Pose3) -> NodeState:
     turn = pose.rotation().matrix() @ state.pose.rotation().matrix().T
-    velocity = state.velocity.copy()
+    velocity = state.motion.copy()
     velocity[VELOCITY] = turn @ velocity[VELOCITY]
-    return NodeState(pose, state.bias, velocity)
+    return NodeState(pose, state.calibration, velocity)

@@ -16,13 +16,13 @@ from terrafix.anchor.frame_pose import (
     confirm_pose,
     with_belief,
 )
-from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, Fix, View
+from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, PatchFix, View
 from terrafix.anchor.matching.match_message import mode_match, pose_match
 from terrafix.anchor.matching.patch_matcher import MAX_PATCHES
 from terrafix.anchor.matching.point_mass_filter import Mode, belief_cell_m
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.limits import MIN_MATCHING_AGL_M
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, solve
+from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, SEARCH_RADIUS, solve
 from terrafix.core.pose import log_so3
 from terrafix.messages import GroundPlane, MapMatch, MatchPlace, PnpInput, Prediction, Verdict
 from terrafix_tools.montecarlo.flown import Shot
@@ -93,7 +93,7 @@ class MapMatches:
             map_sigma_m=self._map_sigma_m,
         )
 
-    def _fix(self, shot: Shot, good: float, view: View) -> Fix:
+    def _fix(self, shot: Shot, good: float, view: View) -> PatchFix:
         xy, points = self._patches(shot, good)
         weights = np.exp(self._rng.normal(*WEIGHT, len(xy)))
         gsd_share = FIX_GSD_PER_AGL["gradient"]
@@ -103,9 +103,9 @@ class MapMatches:
             sigma_floor=0.3 * gsd_share,
             threshold=INLIER_THRESHOLD,
             search_radius=SEARCH_RADIUS,
-            min_inliers=MIN_INLIERS,
+            min_inliers=PNP_MIN_INLIERS,
         )
-        return Fix(xy, points, weights, solve(points, xy, weights, given), gsd_share * view.agl_m, given)
+        return PatchFix(xy, points, weights, solve(points, xy, weights, given), gsd_share * view.agl_m, given)
 
     def _patches(self, shot: Shot, good: float) -> tuple[np.ndarray, np.ndarray]:
         """2D-3D matches: normalised (N, 2) and world points (N, 3), as the map and its elevation have them."""

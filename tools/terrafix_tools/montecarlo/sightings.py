@@ -151,10 +151,10 @@ class SimulatedOdometry:
         gross = rng.uniform(size=n) < GROSS_SHARE
         noise[gross] += GROSS_PX * rng.uniform(-1.0, 1.0, (int(gross.sum()), 2))
         a, b = keyframe.px[keyframe.tracked], (px + keyframe.off_px + keyframe.slip_px + noise)[keyframe.tracked]
-        if len(a) < real.MIN_INLIERS:
+        if len(a) < real.TRACK_MIN_INLIERS:
             return None
         inlier = homography_inliers(a, b)
-        if inlier.sum() < real.MIN_INLIERS or inlier.mean() < real.MIN_INLIER_RATIO:
+        if inlier.sum() < real.TRACK_MIN_INLIERS or inlier.mean() < real.MIN_INLIER_RATIO:
             return None
         keyframe.tracked[np.flatnonzero(keyframe.tracked)[~inlier]] = False  # outliers are dropped for good
         return a[inlier], b[inlier], len(a)

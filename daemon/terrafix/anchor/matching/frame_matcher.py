@@ -15,7 +15,7 @@ from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, patch_centres, rectify
 from terrafix.anchor.matching.patch_matcher import match_patches
-from terrafix.anchor.matching.point_mass_filter import LLR_SLOPE, LLR_ZERO_Z, Surface
+from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_SLOPE, BELIEF_LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
@@ -23,7 +23,7 @@ from terrafix.core.pnp import (
     CUTOFF,
     INDEPENDENT_SHARE,
     INLIER_THRESHOLD,
-    MIN_INLIERS,
+    PNP_MIN_INLIERS,
     SEARCH_RADIUS,
     PnpResult,
     solve,
@@ -116,6 +116,12 @@ class CorrelationResult:
         best = int(np.argmax(scores))
         return self.hypotheses[best], scores[best]
 
+    def is_mapped_at(self, e_m: float, n_m: float) -> bool:
+        """Whether a feature is mapped where ``best_at`` finds the highest correlation."""
+        peaks = [(s, s.best(e_m, n_m, 2.0 * self.cell_m)) for s in self.surfaces]
+        surface, (_, there_e_m, there_n_m) = max(peaks, key=lambda peak: peak[1][0])
+        return surface.is_mapped(there_e_m, there_n_m)
+
     def best_hypotheses(self, count: int) -> tuple[Hypothesis, ...]:
         """The ``count`` hypotheses with the highest standardised correlation anywhere, in their order."""
         scores = [float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in self.surfaces]
@@ -133,7 +139,7 @@ class CorrelationResult:
         scores = np.array([z[s] for s in scales])
         if int(np.argmax(scores)) in (0, len(scales) - 1):
             return None
-        likelihood = np.exp(LLR_SLOPE * (scores - scores.max()))
+        likelihood = np.exp(BELIEF_LLR_SLOPE * (scores - scores.max()))
         likelihood /= likelihood.sum()
         mean = float(likelihood @ scales)
         # Remove the information of the grid itself ("one of these scales"): the prediction chose it.
@@ -143,7 +149,7 @@ class CorrelationResult:
 
 
 @dataclass(frozen=True)
-class Fix:
+class PatchFix:
     """2D-3D matches of one frame and the pose from them. ``xy`` (N, 2): normalised image coordinates; ``points_w_m``
     (N, 3): map points, local east, north and AMSL height; ``weights`` (N,); ``cell_m``: cell size of the patches;
     ``given``: with which PnP has computed ``pnp``; None: another method has."""
@@ -261,14 +267,15 @@ class FrameMatcher:
             z = standardise(correlation)
             # Places without a mapped feature are neither excluded nor preferred: they are as frequent among right
             # places as among all (docs/decisions/042-vectors-as-a-layer.md).
-            if self._drawn:
-                z[np.isneginf(correlation)] = LLR_ZERO_Z
-            surfaces.append(Surface(z, e_min - frame.e_min_m, n_max - frame.n_max_m, cell))
+            unmapped = np.isneginf(correlation) if self._drawn else None
+            if unmapped is not None:
+                z[unmapped] = BELIEF_LLR_ZERO_Z
+            surfaces.append(Surface(z, e_min - frame.e_min_m, n_max - frame.n_max_m, cell, unmapped))
         if not any(np.isfinite(s.z).any() for s in surfaces):
             return CorrelationResult(Verdict.OUTSIDE_MAP)
         return CorrelationResult(Verdict.ACCEPTED, tuple(surfaces), tuple(h for h, _ in usable), footprint_m, cell)
 
-    def fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> Fix | None:
+    def fix(self, image: Image, view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> PatchFix | None:
         """2D-3D matches around a camera position (local east and north) and the PnP pose. None: the camera sees no
         ground.
 
@@ -283,7 +290,7 @@ class FrameMatcher:
         # lean.
         return self._fix_with(self._describer, image, start)
 
-    def _fix_with(self, describer: Describer, image: Image, view: View) -> Fix | None:
+    def _fix_with(self, describer: Describer, image: Image, view: View) -> PatchFix | None:
         if view.tilt_sigma_rad > KNOWN_TILT_RAD:
             first = self._patch_fix(describer, image, view, FIRST_SEARCH_RADIUS, FIRST_THRESHOLD)
             if first is None or first.pnp.fit is None:
@@ -291,7 +298,7 @@ class FrameMatcher:
             view = levelled_view(view, first)
         return self._patch_fix(describer, image, view, SEARCH_RADIUS, INLIER_THRESHOLD)
 
-    def refine_fix(self, image: Image, view: View, fix: Fix) -> Fix:
+    def refine_fix(self, image: Image, view: View, fix: PatchFix) -> PatchFix:
         """Pose of a place that a search has found, recomputed on the cells of normal tracking; ``fix`` itself if that
         is not accepted."""
         if fix.pnp.fit is None:
@@ -301,7 +308,7 @@ class FrameMatcher:
 
     def _patch_fix(
         self, describer: Describer, image: Image, view: View, radius_share: float, threshold: float
-    ) -> Fix | None:
+    ) -> PatchFix | None:
         gsd = self.cell_m(view.agl_m, FIX_GSD_PER_AGL[describer.name])
         cell = gsd * describer.stride
         image = without_colour(image, describer)
@@ -331,9 +338,9 @@ class FrameMatcher:
             sigma_floor=0.3 * cell / view.agl_m,  # a third of a cell: accuracy of sub-cell interpolation of the peak
             threshold=threshold,
             search_radius=radius * cell / view.agl_m,
-            min_inliers=MIN_INLIERS if describer.stride == 1 else LEARNED_INLIERS,
+            min_inliers=PNP_MIN_INLIERS if describer.stride == 1 else LEARNED_INLIERS,
         )
-        return Fix(xy, points, found.weight, solve(points, xy, found.weight, given), cell, given)
+        return PatchFix(xy, points, found.weight, solve(points, xy, found.weight, given), cell, given)
 
     def _next_subset(self, hypotheses: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
         """Subset of the hypotheses that one frame can afford: some of the scales, beginning with the predicted one; the
@@ -362,7 +369,7 @@ def view_at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:
     return replace(view, e_m=e_m, n_m=n_m, r_w_c=r_w_c, agl_m=view.agl_m * hypothesis.scale)
 
 
-def view_of_fix(view: View, fix: Fix) -> View:
+def view_of_fix(view: View, fix: PatchFix) -> View:
     """``view`` with the position, rotation and mean height above ground of the pose of ``fix``, which must have one."""
     assert fix.pnp.fit is not None
     p = fix.pnp.fit.p_c_in_w_m
@@ -370,7 +377,7 @@ def view_of_fix(view: View, fix: Fix) -> View:
     return replace(view, e_m=float(p[0]), n_m=float(p[1]), r_w_c=fix.pnp.fit.r_w_c, agl_m=agl_m)
 
 
-def levelled_view(view: View, fix: Fix) -> View:
+def levelled_view(view: View, fix: PatchFix) -> View:
     """``view_of_fix``, with the tilt that was predicted as a prior. A dozen patches leave the tilt to some degrees, and
     the position to as much of the height: a frame rectified by them alone would be another one for each patch more."""
     assert fix.pnp.fit is not None and fix.given is not None

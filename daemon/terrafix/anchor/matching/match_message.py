@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import Fix, View
+from terrafix.anchor.matching.frame_matcher import PatchFix, View
 from terrafix.anchor.matching.point_mass_filter import Mode
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pnp import map_pose
@@ -67,7 +67,7 @@ def mode_match(match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tu
     )
 
 
-def pose_match(match: MapMatch, fix: Fix | None, view: View) -> MapMatch:
+def pose_match(match: MapMatch, fix: PatchFix | None, view: View) -> MapMatch:
     """Copies a fix and its verdict into ``match``: all 2D-3D matches with what PnP takes beside them, or the pose if
     another method has computed it. ``match.place`` is the place at which the fix was computed; a pose that is more than
     ``MAX_MODE_DRIFT`` heights away from it is DEGENERATE."""
@@ -89,13 +89,13 @@ def pose_match(match: MapMatch, fix: Fix | None, view: View) -> MapMatch:
     return msgspec.structs.replace(match, matches=_matches(fix), pnp=fix.given, pose=None)
 
 
-def _matches(fix: Fix) -> list[tuple[float, float, float, float, float, float]]:
+def _matches(fix: PatchFix) -> list[tuple[float, float, float, float, float, float]]:
     """All 2D-3D matches of ``fix``, as in MapMatch."""
     rows = np.column_stack([fix.xy, fix.points_w_m, fix.weights]).tolist()
     return [(x, y, e_m, n_m, up_m, weight) for x, y, e_m, n_m, up_m, weight in rows]
 
 
-def _agreeing(fix: Fix) -> list[tuple[float, float, float, float, float, float]]:
+def _agreeing(fix: PatchFix) -> list[tuple[float, float, float, float, float, float]]:
     """Those of them that agree with the pose of ``fix``."""
     return [one for one, agrees in zip(_matches(fix), fix.pnp.inliers, strict=True) if agrees]
 
@@ -114,7 +114,7 @@ def ground_sigma_m(fit: PoseFit, agl_m: float) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(ground_cov_m2(cov.ravel().tolist(), agl_m))[-1]))
 
 
-def relocalized_match(match: MapMatch, fix: Fix, view: View, innovation_m: tuple[float, float]) -> MapMatch:
+def relocalized_match(match: MapMatch, fix: PatchFix, view: View, innovation_m: tuple[float, float]) -> MapMatch:
     """``pose_match`` for a place that a search has found: the first pose there, without a prior from earlier frames.
 
     ``innovation_m``: east and north, distance of this frame's place from the one predicted by the earlier frames and

@@ -14,9 +14,9 @@ import numpy as np
 # it is zero. Fitted to the scores of right and wrong places on seven pairs of real images of the same ground at two
 # dates. Right places have z = 3 to 8 (median 3.6 to 6.9 by pair); the best of tens of thousands of wrong places has 3.0
 # in the median (98 % below 4.1). [measured: this comment]
-LLR_SLOPE = 3.0
-LLR_ZERO_Z = 1.9  # [measured: comment of LLR_SLOPE]
-LLR_MIN, LLR_MAX = -3.0, 9.0  # bounds of the log likelihood ratio of one frame [tuned]
+BELIEF_LLR_SLOPE = 3.0
+BELIEF_LLR_ZERO_Z = 1.9  # [measured: comment of BELIEF_LLR_SLOPE]
+BELIEF_LLR_MIN, BELIEF_LLR_MAX = -3.0, 9.0  # bounds of the log likelihood ratio of one frame [tuned]
 # share of the mass that a full observation redistributes uniformly over the window, so that no position is excluded
 # [tuned]
 LEAK = 0.004
@@ -48,12 +48,13 @@ class Mode:
 @dataclass(frozen=True)
 class Surface:
     """``z`` (H, W): standardised correlation with the camera at east e0_m + c cell_m, north n0_m - r cell_m; NaN =
-    unknown."""
+    unknown. ``unmapped`` (H, W): no feature is mapped there, so that ``z`` is no evidence; None: all is mapped."""
 
     z: np.ndarray
     e0_m: float
     n0_m: float
     cell_m: float
+    unmapped: np.ndarray | None = None
 
     def best(self, e_m: float, n_m: float, radius_m: float) -> tuple[float, float, float]:
         """Highest value within ``radius_m`` of a position, and its east and north; -9 outside of the surface."""
@@ -71,6 +72,14 @@ class Surface:
     def at(self, e_m: float, n_m: float, radius_m: float) -> float:
         """Highest value within ``radius_m`` of a position; -9 outside of the surface."""
         return self.best(e_m, n_m, radius_m)[0]
+
+    def is_mapped(self, e_m: float, n_m: float) -> bool:
+        """Whether a feature is mapped at the cell of a position; True outside of the surface."""
+        if self.unmapped is None:
+            return True
+        r, c = round((self.n0_m - n_m) / self.cell_m), round((e_m - self.e0_m) / self.cell_m)
+        inside = 0 <= r < self.unmapped.shape[0] and 0 <= c < self.unmapped.shape[1]
+        return not (inside and self.unmapped[r, c])
 
 
 class Belief:
@@ -237,7 +246,9 @@ def log_likelihood_ratio(z: np.ndarray) -> np.ndarray:
     """Log likelihood ratio "here against elsewhere" of a standardised correlation; an unknown one (NaN or below -5)
     counts slightly worse than random alignment."""
     known = np.nan_to_num(z, nan=-9.0)
-    return np.where(known < -5.0, -1.0, np.clip(LLR_SLOPE * (known - LLR_ZERO_Z), LLR_MIN, LLR_MAX))
+    return np.where(
+        known < -5.0, -1.0, np.clip(BELIEF_LLR_SLOPE * (known - BELIEF_LLR_ZERO_Z), BELIEF_LLR_MIN, BELIEF_LLR_MAX)
+    )
 
 
 def _blurred(mass: np.ndarray, sigma: float) -> np.ndarray:

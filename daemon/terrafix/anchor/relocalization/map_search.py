@@ -14,15 +14,15 @@ from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, Vie
 from terrafix.anchor.matching.ncc import standardise
 from terrafix.anchor.place_index.recognizer import PlaceRecognizer
 from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, BlockCorrelator, blocks_of, select_blocks
-from terrafix.anchor.relocalization.hypothesis_tracker import (
+from terrafix.anchor.relocalization.mosaic import Mosaic
+from terrafix.anchor.relocalization.peaks import UNKNOWN, Peak, find_peaks
+from terrafix.anchor.verification.hypothesis_tracker import (
     MERGE_RADIUS,
     NEIGHBOUR_RADIUS,
     NEW_EVIDENCE,
     AcceptedPlace,
     HypothesisTracker,
 )
-from terrafix.anchor.relocalization.mosaic import Mosaic
-from terrafix.anchor.relocalization.peaks import UNKNOWN, Peak, find_peaks
 from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget, NullRow
 from terrafix.map.package import LocalMap

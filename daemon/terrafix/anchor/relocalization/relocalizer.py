@@ -84,20 +84,21 @@ class Relocalizer:
         if self._probation is not None:
             self._probation.predict(float(np.hypot(*step_m)))
 
-    def test_frame(self, image: Image, view: View | None) -> float:
+    def refutes_place(self, image: Image, view: View | None) -> bool:
         """Sequential test of the last relocalized place with a frame. ``view``: camera at the belief's mode; None: the
-        belief has no dominant mode.
-
-        -> probability that the place is wrong; 0 without a test or once it has passed, 1 once it has failed.
-        """
+        belief has no dominant mode. -> whether the place has failed it."""
         test = self._probation
         if test is None:
-            return 0.0
+            return False
         test.update(image, view)
         if test.passed or test.failed:
             self._probation = None
-            return 0.0 if test.passed else 1.0
-        return test.wrong_probability
+        return test.failed
+
+    @property
+    def wrong_probability(self) -> float:
+        """Probability that the last relocalized place is wrong; 0 while none is tested."""
+        return 0.0 if self._probation is None else self._probation.wrong_probability
 
     def search_match(self, match: MapMatch) -> MapMatch:
         """``match`` as the message of a running search: verdict LOST, without a pose."""

@@ -11,7 +11,7 @@ START_LOG_ODDS = 6.0  # log odds of a start coordinate: one in 400 is wrong by f
 MAX_LOG_ODDS = 20.0
 # Nats of a full observation under the null hypothesis. The right position gives 4 to 9, a wrong one -0.4 to 3 (real
 # flights with the right start and with one 700 m off). [measured: docs/search.md]
-NULL_GAIN = 3.0
+LOCK_NULL_GAIN = 3.0
 # Bounds of one full observation's gain, nats. An observation without evidence counts little against the position, and
 # the next one over the same kind of ground is not independent: a copter that climbed over fields was right through six
 # full observations of -2, and twice as many must not outweigh a start. [measured: this comment]
@@ -53,7 +53,7 @@ class LockMonitor:
         """
         is_wide = has_wide_sigma(sigma_m, agl_m)
         least, most = (0.0, START_LOG_ODDS) if is_wide else (MIN_GAIN * new, MAX_LOG_ODDS)
-        self.log_odds += min(max(evidence_nats - NULL_GAIN * weight, least), MAX_GAIN * weight)
+        self.log_odds += min(max(evidence_nats - LOCK_NULL_GAIN * weight, least), MAX_GAIN * weight)
         if inliers:
             self.log_odds += weight * pose_gain(inliers)
         self.log_odds = min(self.log_odds, most)

@@ -9,8 +9,8 @@ from terrafix.anchor.matching.frame_matcher import (
     FIX_GSD_PER_AGL,
     PATCH_PER_AGL,
     PATCH_STEP,
-    Fix,
     FrameMatcher,
+    PatchFix,
     View,
     view_of_fix,
     without_colour,
@@ -20,7 +20,7 @@ from terrafix.anchor.matching.patch_matcher import correlate_patches
 from terrafix.anchor.verification.patch_consensus import MAX_LLR, PatchConsensus, estimate_consensus
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
-from terrafix.core.pnp import MIN_INLIERS, SEARCH_RADIUS, PnpResult
+from terrafix.core.pnp import PNP_MIN_INLIERS, SEARCH_RADIUS, PnpResult
 from terrafix.core.pose import fit_pose
 from terrafix.map.package import LocalMap
 from terrafix.messages import Verdict
@@ -42,7 +42,7 @@ PATCH_SIGMA = 0.005
 @dataclass(frozen=True)
 class VerifiedPlace:
     consensus: PatchConsensus
-    fix: Fix
+    fix: PatchFix
 
 
 class PlaceVerifier:
@@ -84,7 +84,7 @@ class PlaceVerifier:
         corners, _, surfaces = correlate_patches(
             template, frame.mask, window, valid, patch, radius, row0, column0, centres
         )
-        if len(corners) < MIN_INLIERS:
+        if len(corners) < PNP_MIN_INLIERS:
             return None
         centres = np.array(corners) + 0.5 * patch
         ground_m = np.column_stack([frame.e_min_m + centres[:, 1] * cell_m, frame.n_max_m - centres[:, 0] * cell_m])
@@ -97,7 +97,7 @@ class PlaceVerifier:
         found_m = on_map_m + found.offsets * view.agl_m
         return VerifiedPlace(found, self._pose(view, ground_m, found_m, found, cell_m, tilt_sigma_rad))
 
-    def refine(self, image: Image, view: View, first: Fix) -> Fix | None:
+    def refine(self, image: Image, view: View, first: PatchFix) -> PatchFix | None:
         """The pose ``first``, computed from ``view``, refined on the cells of a fix and without a tilt prior: the
         consumer of the pose already uses the predicted tilt."""
         found = self.verify(
@@ -123,7 +123,7 @@ class PlaceVerifier:
         found: PatchConsensus,
         cell_m: float,
         tilt_sigma_rad: float | None,
-    ) -> Fix:
+    ) -> PatchFix:
         rays = np.column_stack([ground_m, np.full(len(ground_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
         up = self._map.elevation(map_m[:, 0], map_m[:, 1])
@@ -132,7 +132,7 @@ class PlaceVerifier:
         points, weights = np.column_stack([map_m, up]), np.clip(found.values / MAX_LLR, 0.0, 1.0)
         start = np.array([view.e_m, view.n_m, view.ground_m + view.agl_m])
         fit = None
-        if found.inliers.sum() >= MIN_INLIERS:
+        if found.inliers.sum() >= PNP_MIN_INLIERS:
             fit = fit_pose(
                 points[found.inliers],
                 xy[found.inliers],
@@ -146,4 +146,4 @@ class PlaceVerifier:
         if fit is not None:  # weighted with the noise of one patch, reported with the common displacement
             fit = replace(fit, cov=fit.cov * max(SIGMA_FLOOR / fit.sigma, 1.0) ** 2)
         verdict = Verdict.FEW_INLIERS if fit is None else Verdict.ACCEPTED
-        return Fix(xy, points, weights, PnpResult(verdict, fit, found.inliers), cell_m)
+        return PatchFix(xy, points, weights, PnpResult(verdict, fit, found.inliers), cell_m)

@@ -10,7 +10,7 @@ with a mean below one, so the odds of a wrong place exceed a bound with a probab
 import math
 
 from terrafix.anchor.matching.frame_matcher import View
-from terrafix.anchor.relocalization.hypothesis_tracker import LLR_MAX, NEW_EVIDENCE, HypothesisTracker
+from terrafix.anchor.verification.hypothesis_tracker import NEW_EVIDENCE, TRACK_LLR_MAX, HypothesisTracker
 from terrafix.anchor.verification.lock_monitor import MIN_GAIN, START_LOG_ODDS
 from terrafix.anchor.verification.place_verifier import FINE_CELL_PER_AGL, PlaceVerifier
 from terrafix.core.node import Image
@@ -70,5 +70,5 @@ class Probation:
         found = None if view is None else self._verifier.verify(image, view, FINE_CELL_PER_AGL)
         sigmas = None if found is None else self._null.sigmas(found.consensus, fine=True)
         gain = MIN_GAIN if sigmas is None else log_e_value(self._frame_tail.log_probability(sigmas))
-        self._log_odds += min(self._path_m / self._stretch_m, 1.0) * min(max(gain, MIN_GAIN), LLR_MAX)
+        self._log_odds += min(self._path_m / self._stretch_m, 1.0) * min(max(gain, MIN_GAIN), TRACK_LLR_MAX)
         self._path_m = 0.0

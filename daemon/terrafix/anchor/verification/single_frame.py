@@ -10,14 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import CorrelationResult, Fix, FrameMatcher, View, view_at
+from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher, PatchFix, View, view_at
 from terrafix.anchor.matching.point_mass_filter import Mode
-from terrafix.anchor.relocalization.hypothesis_tracker import (
+from terrafix.anchor.verification.hypothesis_tracker import (
     DECISION_MARGIN,
-    LLR_MAX,
-    LLR_SLOPE,
     NEIGHBOUR_RADIUS,
     NULL_SIGMAS,
+    TRACK_LLR_MAX,
+    TRACK_LLR_SLOPE,
 )
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, PlaceVerifier
@@ -26,7 +26,7 @@ from terrafix.map.null_model import NullRow
 from terrafix.map.package import LocalMap
 
 MAX_MODES = 12  # modes that are verified, about 50 ms each [tuned]
-LIKELIHOOD_RATIO = float(np.exp(LLR_MAX))  # factor on the mass of the accepted mode [spec: exp(LLR_MAX)]
+LIKELIHOOD_RATIO = float(np.exp(TRACK_LLR_MAX))  # factor on the mass of the accepted mode [spec: exp(TRACK_LLR_MAX)]
 
 
 def localize_single_frame(
@@ -38,7 +38,7 @@ def localize_single_frame(
     matcher: FrameMatcher,
     null: NullRow,
     log_probability: float,
-) -> tuple[Mode, Fix] | None:
+) -> tuple[Mode, PatchFix] | None:
     """``modes``: of the belief after this frame's correlation. ``null``: null model of the map at this height;
     ``log_probability``: allowed false-alarm probability of this frame. -> the accepted mode with its pose; None: no
     place, or more than one."""
@@ -57,7 +57,7 @@ def localize_single_frame(
         patch_null.add(other.consensus, fine=False)
     sigmas, *rivals = (patch_null.sigmas(c.consensus, fine=False) for c in (best, *others))
     threshold = null.frame.exceedance_value(log_probability - np.log(len(places)))
-    if sigmas < threshold or LLR_SLOPE * (sigmas - max((NULL_SIGMAS, *rivals))) < DECISION_MARGIN:
+    if sigmas < threshold or TRACK_LLR_SLOPE * (sigmas - max((NULL_SIGMAS, *rivals))) < DECISION_MARGIN:
         return None
     fix = verifier.refine(image, view, best.fix)
     return None if fix is None else (mode, fix)

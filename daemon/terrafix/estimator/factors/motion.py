@@ -10,7 +10,7 @@ import numpy as np
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.linearization_cache import custom_factor
-from terrafix.estimator.factors.noise import robust_noise
+from terrafix.estimator.factors.noise import MIN_HEIGHT_M, robust_noise
 from terrafix.estimator.models.motion_model import MotionIncrement
 from terrafix.estimator.state import (
     ACCELERATIONS,
@@ -30,8 +30,6 @@ from terrafix.estimator.state import (
     UP,
     VELOCITY,
 )
-
-MIN_HEIGHT_M = 1.0  # lower bound of a height that the residual is divided by [tuned]
 
 
 def motion_factor(

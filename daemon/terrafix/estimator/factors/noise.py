@@ -1,4 +1,4 @@
-"""Noise models of the factors."""
+"""Noise models of the factors, and what they share."""
 
 import gtsam
 import numpy as np
@@ -6,6 +6,7 @@ import numpy as np
 # Huber threshold, in sigmas, of poses and motion increments: a measurement that passed its gate but lies in the tail
 # gets less weight. [tuned]
 HUBER_K = 2.0
+MIN_HEIGHT_M = 1.0  # lower bound of a height by which a factor scales [tuned]
 
 
 def robust_noise(cov: np.ndarray) -> gtsam.noiseModel.Robust:

@@ -11,7 +11,7 @@ import numpy as np
 
 from terrafix.core.pose import project_with_jacobian
 from terrafix.estimator.factors.linearization_cache import custom_factor
-from terrafix.estimator.factors.noise import whiten_common
+from terrafix.estimator.factors.noise import MIN_HEIGHT_M, whiten_common
 from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS, Ground
 from terrafix.estimator.state import (
     CALIBRATION_SIZE,
@@ -37,7 +37,6 @@ REDUCED_SIZE = (
 STEP_AND_CONSTANT = [0, 1, 2, 3, 4, 5, 10]  # columns of the QR [spec: order of the stacked Jacobian]
 TILT_COLUMNS, K1_COLUMN = slice(6, 9), 9  # [spec: order of the stacked Jacobian]
 STEP_COLUMNS, CONSTANT_COLUMN = slice(0, 6), 6  # of the reduced step and constant [spec: STEP_AND_CONSTANT]
-MIN_HEIGHT_M = 1.0  # lower bound of the height over the plane [tuned]
 RADIAL, UNIFORM = 2, 0  # powers of the distance from the centre [spec: division model; focal length]
 RIGHT_DOWN = slice(3, 5)  # translation within the image plane [spec: tangent order of a pose]
 

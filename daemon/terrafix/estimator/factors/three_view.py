@@ -16,6 +16,7 @@ import numpy as np
 from terrafix.core.camera import undistort_division
 from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.linearization_cache import custom_factor
+from terrafix.estimator.factors.noise import MIN_HEIGHT_M
 from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS
 from terrafix.estimator.state import (
     CALIBRATION_SIZE,
@@ -54,7 +55,6 @@ ESTIMATED, NUISANCE = 13, 2
 FIRST, LAST, CAMERAS, K1 = slice(0, 6), slice(6, 12), slice(0, 12), 12  # of the estimated [spec: layout]
 K2, FOCAL = 13, 14  # columns of the nuisance parameters [spec: layout]
 MIN_DEPTH = 0.05  # of a point in an outer camera, in units of its depth in the middle one [tuned]
-MIN_HEIGHT_M = 1.0  # lower bound of the height that scales the translations [tuned]
 
 
 @dataclass(frozen=True)

@@ -67,8 +67,8 @@ def values_of(states: Mapping[int, NodeState]) -> gtsam.Values:
     values = gtsam.Values()
     for node, state in states.items():
         values.insert(C(node), state.pose)
-        values.insert(B(node), state.bias)
-        values.insert(V(node), state.velocity)
+        values.insert(B(node), state.calibration)
+        values.insert(V(node), state.motion)
     return values
 
 

@@ -178,10 +178,10 @@ class MarginalizedHistory:
             return
         around = gtsam.Values()
         for node in nodes:
-            pose, bias, velocity = self._values[node]
+            pose, calibration, motion = self._values[node]
             around.insert(C(node), pose)
-            around.insert(B(node), bias)
-            around.insert(V(node), velocity)
+            around.insert(B(node), calibration)
+            around.insert(V(node), motion)
         self._linear.append(linearize(graph, sorted(nodes), around))
 
     def _closest_retained(self) -> int | None:

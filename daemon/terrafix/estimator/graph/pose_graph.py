@@ -33,14 +33,14 @@ REBUILD_CALIBRATION_SIGMAS = np.array([0.1, 0.1, 0.1, 5.0, RADIAL_K1_SIGMA, 0.1]
 
 @dataclass(frozen=True)
 class GraphPrior:
-    """First node of a graph: ``cov`` (6, 6) of its pose in tangent order, ``bias_cov`` (6, 6) of B, ``velocity_cov``
-    (8, 8) of V, and a factor of the reported attitude and height. ``gauge_fixed_cov`` (6, 6): enters the graph instead
-    of ``cov`` where part of the pose is unobservable and fixed by choice (yaw_gauge.py)."""
+    """First node of a graph: ``cov`` (6, 6) of its pose in tangent order, ``calibration_cov`` (6, 6) of B,
+    ``motion_cov`` (8, 8) of V, and a factor of the reported attitude and height. ``gauge_fixed_cov`` (6, 6): enters the
+    graph instead of ``cov`` where part of the pose is unobservable and fixed by choice (yaw_gauge.py)."""
 
     state: NodeState
     cov: np.ndarray
-    bias_cov: np.ndarray
-    velocity_cov: np.ndarray
+    calibration_cov: np.ndarray
+    motion_cov: np.ndarray
     attitude: gtsam.CustomFactor | None = None
     gauge_fixed_cov: np.ndarray | None = None
 
@@ -53,7 +53,7 @@ class GraphPrior:
     def node_covariance(self) -> np.ndarray:
         """(NODE_SIZE, NODE_SIZE), in the order C, B, V."""
         cov, end = np.zeros((NODE_SIZE, NODE_SIZE)), 0
-        for block in (self.pose_cov, self.bias_cov, self.velocity_cov):
+        for block in (self.pose_cov, self.calibration_cov, self.motion_cov):
             begin, end = end, end + len(block)
             cov[begin:end, begin:end] = block
         return cov
@@ -63,7 +63,7 @@ class GraphPrior:
 class NewNode:
     """A node that is tied to ``parent`` (in the window) by ``motion``, and to the newest node by ``increment``; None:
     the vehicle is stationary. ``rise_sigma_m``: change of ground elevation since the newest node, without a DEM.
-    ``three_view``: an earlier node, and the constraint of that node, ``parent`` and this one. ``velocity_cov`` (8, 8):
+    ``three_view``: an earlier node, and the constraint of that node, ``parent`` and this one. ``motion_cov`` (8, 8):
     V of the node is known to this, independently of the nodes before; None: through ``increment``. ``links``: further
     nodes that stay in the window, and the matched rays of this one with them."""
 
@@ -74,7 +74,7 @@ class NewNode:
     attitude: gtsam.CustomFactor | None
     rise_sigma_m: float = 0.0
     three_view: tuple[int, ThreeViewConstraint] | None = None
-    velocity_cov: np.ndarray | None = None
+    motion_cov: np.ndarray | None = None
     links: tuple[tuple[int, MatchedRays], ...] = ()
 
 
@@ -150,8 +150,8 @@ class PoseGraph:
             pose = self._smoother.pose(node)
             # Rounding moves rotations off SO(3), and each frame builds on the last one: without this the error doubles.
             orthonormal = gtsam.Pose3(gtsam.Rot3.ClosestTo(pose.rotation().matrix()), pose.translation())
-            bias, velocity = (self._smoother.vector(key(node)) for key in (B, V))
-            self._states[node] = NodeState(orthonormal, bias, velocity)
+            calibration, motion = (self._smoother.vector(key(node)) for key in (B, V))
+            self._states[node] = NodeState(orthonormal, calibration, motion)
         return self._states[node]
 
     def linearization(self, node: int) -> NodeState:
@@ -173,11 +173,11 @@ class PoseGraph:
         """Marginal of C, (6, 6), tangent order, from the smoother."""
         return self._marginal(C(node))
 
-    def velocity_covariance(self, node: int) -> np.ndarray:
+    def motion_covariance(self, node: int) -> np.ndarray:
         """Marginal of V, (8, 8)."""
         return self._marginal(V(node))
 
-    def bias_covariance(self, node: int) -> np.ndarray:
+    def calibration_covariance(self, node: int) -> np.ndarray:
         """Marginal of B, (6, 6)."""
         return self._marginal(B(node))
 
@@ -262,9 +262,9 @@ class PoseGraph:
 
     def _motion_factor(self, node: int, new: NewNode) -> gtsam.NoiseModelFactor:
         newest, increment = self.newest, new.increment
-        if new.velocity_cov is not None:
-            noise = gtsam.noiseModel.Gaussian.Covariance(new.velocity_cov)
-            return gtsam.PriorFactorVector(V(node), new.state.velocity, noise)
+        if new.motion_cov is not None:
+            noise = gtsam.noiseModel.Gaussian.Covariance(new.motion_cov)
+            return gtsam.PriorFactorVector(V(node), new.state.motion, noise)
         if increment is not None:
             keys = (C(newest), V(newest)), (C(node), V(node)), (B(newest), B(node))
             return motion_factor(*keys, increment, new.state.pose.rotation())
@@ -362,8 +362,8 @@ class PoseGraph:
 
 def rebuild_prior(state: NodeState) -> GraphPrior:
     """Prior of the one node of a graph that was built anew."""
-    pose_cov, bias_cov = np.diag(REBUILD_POSE_SIGMAS**2), np.diag(REBUILD_CALIBRATION_SIGMAS**2)
-    return GraphPrior(state, pose_cov, bias_cov, unknown_motion_cov())
+    pose_cov, calibration_cov = np.diag(REBUILD_POSE_SIGMAS**2), np.diag(REBUILD_CALIBRATION_SIGMAS**2)
+    return GraphPrior(state, pose_cov, calibration_cov, unknown_motion_cov())
 
 
 def _empty_factor(node: int) -> gtsam.LinearContainerFactor:
@@ -381,7 +381,7 @@ def _prior_factors(node: int, prior: GraphPrior) -> tuple[gtsam.NonlinearFactor,
     gaussian = gtsam.noiseModel.Gaussian.Covariance
     pose_prior = gtsam.PriorFactorPose3(C(node), prior.state.pose, gaussian(prior.pose_cov))
     others: list[gtsam.NonlinearFactor] = [
-        gtsam.PriorFactorVector(B(node), prior.state.bias, gaussian(prior.bias_cov)),
-        gtsam.PriorFactorVector(V(node), prior.state.velocity, gaussian(prior.velocity_cov)),
+        gtsam.PriorFactorVector(B(node), prior.state.calibration, gaussian(prior.calibration_cov)),
+        gtsam.PriorFactorVector(V(node), prior.state.motion, gaussian(prior.motion_cov)),
     ]
     return pose_prior, others if prior.attitude is None else [*others, prior.attitude]

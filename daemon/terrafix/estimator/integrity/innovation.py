@@ -36,13 +36,9 @@ class Innovation:
     def is_accepted(self) -> bool:
         return self.mahalanobis2 <= self.limit
 
-
-@dataclass(frozen=True)
-class ScalarInnovation:
-    """Measured less predicted, and the 1-sigma of the difference, in the unit of the measurement."""
-
-    residual: float
-    sigma: float
+    def verdict(self, measurement: str, detail: str = "", rejected: Verdict = Verdict.INNOVATION) -> "FusionVerdict":
+        """The verdict of the gate. ``rejected``: of an innovation beyond ``limit``."""
+        return FusionVerdict(measurement, Verdict.ACCEPTED if self.is_accepted else rejected, self, detail)
 
 
 @dataclass(frozen=True)

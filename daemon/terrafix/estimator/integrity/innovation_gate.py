@@ -5,6 +5,9 @@ a power line. The graph would weight such a reading like any other: one height o
 whole trajectory along, and later odometry is interpreted with the wrong scale. A rejected reading is treated as a
 missing one. Compare the innovation gates and the fusion time-out of PX4's EKF2."""
 
+from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
+from terrafix.messages import Verdict
+
 # Consecutive rejections without a map fix since the first of them, after which the next reading is accepted: the
 # estimate itself may be wrong. [tuned]
 FUSION_TIMEOUT_SAMPLES = 10
@@ -15,11 +18,11 @@ REINIT_MAX_ACCEPTED = 10  # readings [tuned]
 
 
 class InnovationGate:
-    """Gate of one scalar measurement at ``gate_sigmas``. Counts accepted readings since (re-)initialisation and
+    """Gate of one measurement, ``name`` in its verdicts. Counts accepted readings since (re-)initialisation and
     consecutive rejections."""
 
-    def __init__(self, gate_sigmas: float) -> None:
-        self.gate_sigmas = gate_sigmas
+    def __init__(self, name: str) -> None:
+        self._name = name
         self._accepted = 0  # since the (re-)initialisation
         self._rejected = 0  # consecutive
         self._fixed_s: float | None = None  # time of the last map fix at the first of these rejections
@@ -33,13 +36,15 @@ class InnovationGate:
         """For a flight without any map fix: the accepted readings may be wrong, begin again with the rejected one."""
         return self._accepted == 1 or (self._rejected >= REINIT_SAMPLES and self._accepted <= REINIT_MAX_ACCEPTED)
 
-    def rejects(self, innovation: float, sigma: float, fixed_s: float | None) -> bool:
-        """Whether a reading is rejected. ``innovation`` and its 1-sigma in the same unit; ``fixed_s``: time of the last
-        map fix, None if there was none."""
-        if abs(innovation) <= self.gate_sigmas * sigma:
+    def rejection(self, innovation: Innovation, fixed_s: float | None) -> FusionVerdict | None:
+        """The verdict on a reading that is rejected; None: it is accepted, by the gate or after the time-out.
+        ``fixed_s``: time of the last map fix, None if there was none."""
+        if innovation.is_accepted:
             self._accepted, self._rejected = self._accepted + 1, 0
-            return False
+            return None
         if not self._rejected or fixed_s != self._fixed_s:
             self._rejected, self._fixed_s = 0, fixed_s
         self._rejected += 1
-        return self._rejected <= FUSION_TIMEOUT_SAMPLES
+        if self._rejected > FUSION_TIMEOUT_SAMPLES:
+            return None
+        return innovation.verdict(self._name, rejected=Verdict.IMPLAUSIBLE)

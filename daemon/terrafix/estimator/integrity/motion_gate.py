@@ -26,10 +26,6 @@ class MotionInnovation:
     dt_s: float
     inertial: bool
 
-    @property
-    def passes_gate(self) -> bool:
-        return self.gated.is_accepted
-
     @cached_property
     def gated(self) -> Innovation:
         """The part of the residual that no manoeuvre explains."""

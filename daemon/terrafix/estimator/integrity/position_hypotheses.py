@@ -88,6 +88,10 @@ class PositionHypotheses:
         """A map match agreed with the estimate."""
         self._start_sigma_m, self._modes, self._belief = 0.0, (), None
 
+    def on_relocalized(self) -> None:
+        """A search over several frames has found the position: what matches said before does not count."""
+        self.other, self.map_consistency = AlternativePosition(), MapConsistency()
+
     def on_reset(self, anywhere_m: float) -> None:
         """The graph was reset to a map match. ``anywhere_m``: not 0 while the anchor still verifies that place."""
         self.on_match_accepted()

@@ -19,17 +19,21 @@ class YawGauge:
     one each time. So the graph fixes the gauge, and the published covariance has it free: a rotation of the whole
     trajectory about ``pivot_m`` (2,), east and north, with 1-sigma ``sigma_rad``.
 
-    ``unobserved``: no odometry since the gauge was freed."""
+    ``fused``: odometry was fused since the gauge was freed."""
 
-    def __init__(self, pivot_m: np.ndarray, sigma_rad: float = UNKNOWN_RAD, unobserved: bool = False) -> None:
+    def __init__(self, pivot_m: np.ndarray, sigma_rad: float = UNKNOWN_RAD, fused: bool = True) -> None:
         self._pivot_m = pivot_m.copy()
         self._sigma_rad = sigma_rad
-        self.unobserved = unobserved
+        self.fused = fused
 
-    def after_unobserved(self, dt_s: float, pivot_m: np.ndarray | None = None) -> "YawGauge":
+    def after_gap(self, dt_s: float, pivot_m: np.ndarray | None = None) -> "YawGauge":
         """After ``dt_s`` without odometry, in which the vehicle may have turned. ``pivot_m`` (2,): a new pivot."""
         sigma_rad = min(self._sigma_rad + UNOBSERVED_TURN_RADPS * dt_s, UNKNOWN_RAD)
-        return YawGauge(self._pivot_m if pivot_m is None else pivot_m, sigma_rad, unobserved=True)
+        return YawGauge(self._pivot_m if pivot_m is None else pivot_m, sigma_rad, fused=False)
+
+    def after_odometry(self) -> "YawGauge":
+        """After a frame with fused odometry."""
+        return YawGauge(self._pivot_m, self._sigma_rad)
 
     @property
     def sigma_share(self) -> float:

@@ -77,9 +77,9 @@ class AirspeedMeasurement:
 
     def innovation(self, state: FilterState, node: int) -> Innovation:
         newest, observed = state.graph.state(node), self.observation
-        residual = observed.velocity(float(newest.bias[HEADING])) - newest.velocity[:2]
+        residual = observed.velocity(float(newest.calibration[HEADING])) - newest.motion[:2]
         now = observed.common + observed.changed + observed.gust2 * np.eye(2)
-        return Innovation(residual, now + state.covariances.velocity(node)[:2, :2], GATE[2])
+        return Innovation(residual, now + state.covariances.motion(node)[:2, :2], GATE[2])
 
     def add_to(self, state: FilterState, node: int) -> None:
         cov = self.observation.cov(self.dt_s, self.unseen_s)
@@ -188,7 +188,7 @@ class AirspeedAid(AidSource):
         observation = self._observation(sample.t_s, state.graph.state(sample.node), sample.attitude)
         if observation is None:
             return None
-        return AirspeedMeasurement(observation, sample.dt_s, sample.t_s - state.last_seen_s)
+        return AirspeedMeasurement(observation, sample.dt_s, sample.t_s - state.last_fused_s)
 
     def on_fused(self, sample: AidSample, verdict: Verdict) -> None:
         if verdict is not Verdict.ACCEPTED:
@@ -197,7 +197,7 @@ class AirspeedAid(AidSource):
     def after_frame(self, frame: FrameState, attitude: Attitude) -> None:
         if attitude.yaw_rad is None or attitude.stands or self._state.yaw_gauge is not None:
             return
-        yaw_rad = attitude.yaw_rad - float(self._state.graph.state(frame.node).bias[HEADING])
+        yaw_rad = attitude.yaw_rad - float(self._state.graph.state(frame.node).calibration[HEADING])
         self._wind.update(frame.t_s, frame.velocity_mps, frame.velocity_cov, attitude.airspeed_mps, yaw_rad)
 
     def observes_velocity(self, t_s: float, node: NodeState, attitude: Attitude) -> bool:
@@ -206,4 +206,4 @@ class AirspeedAid(AidSource):
     def _observation(self, t_s: float, node: NodeState, attitude: Attitude) -> AirspeedObservation | None:
         if self._state.yaw_gauge is not None:
             return None
-        return self._wind.predict(t_s, attitude.airspeed_mps, attitude.yaw_rad, float(node.velocity[UP]))
+        return self._wind.predict(t_s, attitude.airspeed_mps, attitude.yaw_rad, float(node.motion[UP]))

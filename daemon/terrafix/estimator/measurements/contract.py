@@ -23,8 +23,7 @@ class Measurement(Protocol):
 
 def fuse(state: FilterState, node: int, measurement: Measurement) -> FusionVerdict:
     """Evaluates ``measurement``, gates it, and adds it to ``node`` of the window."""
-    innovation = measurement.innovation(state, node)
-    if not innovation.is_accepted:
-        return FusionVerdict(measurement.name, Verdict.INNOVATION, innovation)
-    measurement.add_to(state, node)
-    return FusionVerdict(measurement.name, Verdict.ACCEPTED, innovation)
+    fusion = measurement.innovation(state, node).verdict(measurement.name)
+    if fusion.verdict is Verdict.ACCEPTED:
+        measurement.add_to(state, node)
+    return fusion

@@ -160,7 +160,7 @@ class DeadReckoningAid(AidSource):
         tilt_rad = np.radians(state.origin.attitude_sigma_deg)
         tilts_rad = tilt_rad, float(np.hypot(tilt_rad, attitude.righted_rad))
         since = sample.imu(*sorted((round(reckoned.t_s * 1e9), round(sample.t_s * 1e9))))
-        heading_bias_rad = float(state.graph.state(sample.node).bias[HEADING])
+        heading_bias_rad = float(state.graph.state(sample.node).calibration[HEADING])
         at_frame = reckoned.until(sample.t_s, since, attitude.yaw_rad, heading_bias_rad, tilts_rad)
         return DeadReckoningMeasurement(at_frame)
 

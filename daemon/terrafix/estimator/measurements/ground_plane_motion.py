@@ -14,7 +14,7 @@ from terrafix.messages import Odometry, Relocalization, Verdict
 # Share of the height by which the level of the ground below may be unknown. Beyond it odometry tells no distance, and
 # its noise, a share of the estimated distance, would make the graph sure that there is none.
 MAX_LEVEL_SIGMA = 0.5  # [tuned]
-MIN_HEIGHT_M = 2.0  # above the ground: below it the ground is no plane to a camera [tuned]
+MIN_PLANE_HEIGHT_M = 2.0  # above the ground: below it the ground is no plane to a camera [tuned]
 
 
 def plane_motion(
@@ -29,13 +29,13 @@ def plane_motion(
     ``expected``: R_w_c (3, 3) of the camera as a first guess, and the 1-sigma of its tilt [rad]. ``way_m``: about the
     horizontal distance of the two cameras."""
     height_m, r_w_kf, newest = keyframe.height_m, keyframe.pose.rotation().matrix(), state.graph.newest
-    if height_m < MIN_HEIGHT_M:
+    if height_m < MIN_PLANE_HEIGHT_M:
         return Verdict.TOO_LOW
     ground = ground_below(state, keyframe, min(1.0, seen.inliers / max(seen.tracked, 1)))
     if ground.level_sigma_m > MAX_LEVEL_SIGMA * height_m:
         return Verdict.DEGENERATE
     ground = replace(ground, rise_sigma_m=state.terrain.rise_sigma_m(way_m))
-    pairs, radial_k1 = np.array(seen.two_view), float(state.graph.state(newest).bias[RADIAL_K1])
+    pairs, radial_k1 = np.array(seen.two_view), float(state.graph.state(newest).calibration[RADIAL_K1])
     motion = relative_pose(pairs, seen.sigma_norm, r_w_kf, *expected, ground, radial_k1)
     return Verdict.FEW_INLIERS if motion is None else motion
 

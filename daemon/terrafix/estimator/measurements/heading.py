@@ -6,7 +6,7 @@ import numpy as np
 
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState
-from terrafix.estimator.integrity.innovation import ScalarInnovation
+from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.state import WORLD_YAW, NodeState
 
@@ -16,7 +16,7 @@ COMPASS_SWING_RAD = np.radians(5.0)  # 1-sigma, by which the bias of a compass c
 
 def heading_innovation(
     state: FilterState, attitude: Attitude, parent: int, r_kf_c: np.ndarray, before: NodeState
-) -> ScalarInnovation:
+) -> Innovation:
     """The reported heading less the predicted one [rad], of a frame that has turned by ``r_kf_c`` (3, 3) since its
     keyframe, node ``parent``. ``before``: the newest node. Zero where no heading is reported."""
     assert state.last is not None
@@ -25,6 +25,6 @@ def heading_innovation(
     reported2 = np.radians(state.origin.yaw_sigma_deg) ** 2 + attitude.turned_rad**2
     sigma_rad = float(np.sqrt(reported2 + COMPASS_SWING_RAD**2 + cov[WORLD_YAW, WORLD_YAW]))
     if attitude.yaw_rad is None:
-        return ScalarInnovation(0.0, sigma_rad)
-    reported_rad = state.camera.yaw_rad(state.camera.expected(attitude, before.bias))
-    return ScalarInnovation(math.remainder(reported_rad - yaw_rad, math.tau), sigma_rad)
+        return Innovation.scalar(0.0, sigma_rad, HEADING_GATE_SIGMAS)
+    reported_rad = state.camera.yaw_rad(state.camera.expected(attitude, before.calibration))
+    return Innovation.scalar(math.remainder(reported_rad - yaw_rad, math.tau), sigma_rad, HEADING_GATE_SIGMAS)

@@ -5,7 +5,7 @@ import numpy as np
 from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState
-from terrafix.estimator.integrity.innovation import ScalarInnovation
+from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.state import HEIGHT, LOG_HEIGHT_SCALE, UP, NodeState
 
@@ -16,16 +16,16 @@ LOW_RATIO = 1.5  # of MIN_MATCHING_AGL_M: above this reported height a lower est
 
 def height_innovation(
     state: FilterState, agl_m: float, p_m: np.ndarray, before: NodeState, moved_m2: float
-) -> ScalarInnovation:
+) -> Innovation:
     """The reported height ``agl_m`` less the one that a camera at ``p_m`` (3,) predicts [m].
     ``moved_m2``: variance of the climb since ``before``, the newest node."""
     assert state.last is not None
     ground_m = state.terrain.elevation_m(p_m)
-    expected_m = np.exp(before.bias[LOG_HEIGHT_SCALE]) * (float(p_m[UP] + before.bias[HEIGHT]) - ground_m)
+    expected_m = np.exp(before.calibration[LOG_HEIGHT_SCALE]) * (float(p_m[UP] + before.calibration[HEIGHT]) - ground_m)
     reported_m = (state.origin.ground_amsl_m or 0.0) + agl_m - ground_m
     cov = tangent_to_world(state.last.cov, before.pose.rotation().matrix())
     sigma_m = float(np.sqrt(state.origin.agl_sigma_m**2 + cov[UP, UP] + moved_m2))
-    return ScalarInnovation(reported_m - float(expected_m), sigma_m)
+    return Innovation.scalar(reported_m - float(expected_m), sigma_m, HEIGHT_GATE_SIGMAS)
 
 
 def reported_agl_m(state: FilterState, attitude: Attitude, p_m: np.ndarray) -> float:

@@ -16,7 +16,7 @@ NAME = "link"  # in verdicts
 
 
 @dataclass(frozen=True)
-class KeyframeLink:
+class LinkMeasurement:
     """A keyframe that both a frame and its ``parent`` are related to: ``motion`` of the frame since the keyframe, whose
     node is ``keyframe``, and ``known``, its motion since ``parent``."""
 
@@ -36,9 +36,7 @@ class KeyframeLink:
         return Innovation(residual, cov + self.known.cov + self.motion.cov, GATE[6])
 
     def verdict(self, state: FilterState) -> FusionVerdict:
-        innovation = self.innovation(state)
-        verdict = Verdict.ACCEPTED if innovation.is_accepted else Verdict.INNOVATION
-        return FusionVerdict(NAME, verdict, innovation, f"keyframe {self.frame_id}")
+        return self.innovation(state).verdict(NAME, f"keyframe {self.frame_id}")
 
 
 def refused(odometry: Odometry, verdict: Verdict) -> FusionVerdict:

@@ -20,7 +20,7 @@ from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.ground_plane_motion import plane_motion
 from terrafix.estimator.measurements.heading import heading_innovation
-from terrafix.estimator.measurements.keyframe_link import KeyframeLink, by_link, refused
+from terrafix.estimator.measurements.keyframe_link import LinkMeasurement, by_link, refused
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.state import HEADING, HEIGHT, HORIZONTAL, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
@@ -40,7 +40,7 @@ class KeyframeMotion:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class GatedOdometry:
     """Odometry of one frame. ``motion``: None without one. ``fused``: the same, if it enters the graph. ``fragment``:
     to which the frame belongs. ``local_step_m`` (2,): since the frame before, in a fragment that was not confirmed yet.
     ``innovation``: against the motion model, without what a manoeuvre explains, and ``motion_innovation`` with it; None
@@ -61,7 +61,7 @@ class Sighting:
 
 
 class OdometryMeasurement:
-    """``sighting`` of each frame, in order; then ``turn`` and ``three_view`` of the same."""
+    """``gated`` of each frame, in order; then ``turn`` and ``three_view`` of the same."""
 
     def __init__(self, state: FilterState) -> None:
         self._state = state
@@ -69,16 +69,16 @@ class OdometryMeasurement:
         # Of the newest frame: time, keyframe, heading since that.
         self._heading_seen: tuple[int, int, float] | None = None
 
-    def sighting(self, frame: FrameInput, before: NodeState, increment: Callable[[], MotionIncrement]) -> Sighting:
+    def gated(self, frame: FrameInput, before: NodeState, increment: Callable[[], MotionIncrement]) -> GatedOdometry:
         """``before``: the newest node; ``increment()``: of the motion model, from there to the frame."""
         odometry, attitude, t_s = frame.odometry, frame.attitude, frame.t_s
         alone = Fragment(t_s, odometry.fragment_id)  # of a frame without odometry that is fused
         if odometry.verdict in (Verdict.BAD_IMAGE, Verdict.STALLED):  # no new view
-            return Sighting(odometry.verdict, None, alone)
+            return GatedOdometry(odometry.verdict, None, alone)
         answer = self._first_motion(odometry, frame)
         if isinstance(answer, Verdict):
             frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False)
-            return Sighting(Verdict.STALLED if frozen else answer, None, alone)
+            return GatedOdometry(Verdict.STALLED if frozen else answer, None, alone)
         state, parent = self._state, answer.parent
         fragment, keyframe = state.fragments.of(parent), state.graph.state(parent).pose
         fragment.fragment_id = odometry.fragment_id  # the fragment may begin at a frame that was registered to none
@@ -88,23 +88,23 @@ class OdometryMeasurement:
         motion, innovation, was_confirmed = None, None, fragment.confirmed
         if attitude.stands or state.yaw_gauge is not None:  # nothing predicts the motion
             if self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False):
-                return Sighting(Verdict.STALLED, None, alone)
+                return GatedOdometry(Verdict.STALLED, None, alone)
             fragment.confirmed = True
             fragment.joined = fragment.joined or attitude.stands
         else:
             motion = self._innovation(t_s, keyframe.translation() + moved_m, answer, before, increment())
             innovation, moves = motion.gated, not motion.allows_standstill
             frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=moves)
-            if frozen or not motion.passes_gate:
+            if frozen or not innovation.is_accepted:
                 verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
                 state.image_jump = None if frozen else (t_s, motion.residual_m[HORIZONTAL])
-                return Sighting(verdict, None, alone, innovation=innovation)
+                return GatedOdometry(verdict, None, alone, innovation=innovation)
             if not fragment.confirmed:
                 self._weigh_fragment(fragment, frame, answer, before, motion)
         verdict = Verdict.ACCEPTED if fragment.confirmed else Verdict.UNCONFIRMED
         fragment.displacement_m = in_fragment_m
         disconnected = fragment.confirmed and not was_confirmed and not fragment.joined
-        return Sighting(verdict, answer, fragment, local_step_m, innovation, disconnected, motion)
+        return GatedOdometry(verdict, answer, fragment, local_step_m, innovation, disconnected, motion)
 
     def _weigh_fragment(
         self,
@@ -117,22 +117,22 @@ class OdometryMeasurement:
         """Whether motion and turn of a fragment that is not confirmed are those of this flight."""
         over_s = max(frame.t_s - self._state.graph.time_of(seen.parent), 1e-3)
         heading = heading_innovation(self._state, frame.attitude, seen.parent, seen.motion.r, before)
-        turns_agree = abs(heading.residual) <= HEADING_GATE * heading.sigma
-        inertial = innovation.inertial and self._state.continuity.unseen_inertial
+        turns_agree = heading.mahalanobis2 <= HEADING_GATE**2
+        inertial = innovation.inertial and self._state.continuity.inertial_since_fused
         evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree, inertial)
         fragment.add_frame(frame.t_s, evidence)
 
-    def turn(self, sighting: Sighting) -> Turn | None:
+    def turn(self, gated: GatedOdometry) -> Turn | None:
         """Change of heading since the frame before, when both were seen from one keyframe, or that frame is the
         keyframe."""
         before, self._heading_seen = self._heading_seen, None
-        if sighting.motion is None:
+        if gated.motion is None:
             return None
-        state, parent, odometry = self._state, sighting.motion.parent, sighting.motion.odometry
+        state, parent, odometry = self._state, gated.motion.parent, gated.motion.odometry
         node = state.graph.state(parent)
         r_w_kf = node.pose.rotation().matrix()
-        rotations = (r_w_kf, r_w_kf @ sighting.motion.motion.r)
-        yaw_kf_rad, yaw_rad = (yaw_of(state.camera.body(r_w_c, node.bias)) for r_w_c in rotations)
+        rotations = (r_w_kf, r_w_kf @ gated.motion.motion.r)
+        yaw_kf_rad, yaw_rad = (yaw_of(state.camera.body(r_w_c, node.calibration)) for r_w_c in rotations)
         since_rad = yaw_rad - yaw_kf_rad
         self._heading_seen = (odometry.t_ns, odometry.keyframe_id, since_rad)
         if before is not None and before[1] == odometry.keyframe_id:
@@ -150,14 +150,14 @@ class OdometryMeasurement:
             return None
         before, middle = state.graph.state(first), state.graph.state(seen.parent)
         ground_m = state.terrain.elevation_m(middle.pose.translation())
-        risen = 0.0 if state.terrain.has_dem else float(before.bias[HEIGHT] - middle.bias[HEIGHT])
+        risen = 0.0 if state.terrain.has_dem else float(before.calibration[HEIGHT] - middle.calibration[HEIGHT])
         moved = gtsam.Pose3(before.pose.rotation(), before.pose.translation() + np.array([0.0, 0.0, risen]))
         guess = ThreeViewPose(
             middle.pose.between(moved),
             seen.motion.between,
             float(middle.pose.translation()[UP]) - ground_m,
             ground_m,
-            float(middle.bias[RADIAL_K1]),
+            float(middle.calibration[RADIAL_K1]),
         )
         triples, sigma_norm = np.array(odometry.three_view), odometry.three_view_sigma_norm
         constraint = three_view_constraint(triples, sigma_norm, guess, state.origin.camera.focal_sigma)
@@ -171,21 +171,21 @@ class OdometryMeasurement:
     ) -> MotionInnovation:
         """Innovation of a camera position ``p_m`` (3,) by odometry, against the motion model."""
         state = self._state
-        predicted_m, _ = increment.predict(before.pose.translation(), before.velocity, float(before.bias[HEADING]))
+        predicted_m, _ = increment.predict(before.pose.translation(), before.motion, float(before.calibration[HEADING]))
         dt_s = state.graph.since_newest_s(t_s)
-        cov_m2 = predict_covariance(increment, state.velocity_cov)[:3, :3]
+        cov_m2 = predict_covariance(increment, state.motion_cov)[:3, :3]
         if not state.fragments.of(seen.parent).confirmed:  # the motion model alone led here from the keyframe
             since_s = t_s - state.graph.time_of(seen.parent)
-            cov_m2 += state.velocity_cov[VELOCITY, VELOCITY] * max(since_s**2 - dt_s**2, 0.0)
+            cov_m2 += state.motion_cov[VELOCITY, VELOCITY] * max(since_s**2 - dt_s**2, 0.0)
         r_w_c = state.graph.state(seen.parent).pose.rotation().matrix() @ seen.motion.r
         seen_m2 = r_w_c @ seen.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T
         return MotionInnovation(p_m - predicted_m, cov_m2 + seen_m2, dt_s, increment.inertial)
 
-    def links(self, seen: KeyframeMotion, frame: FrameInput) -> list[KeyframeLink | FusionVerdict]:
+    def links(self, seen: KeyframeMotion, frame: FrameInput) -> list[LinkMeasurement | FusionVerdict]:
         """The further keyframes of the frame, each with its motion or with the reason why there is none."""
         return [self._link(by_link(seen.odometry, i), seen, frame) for i in range(len(seen.odometry.links))]
 
-    def _link(self, odometry: Odometry, seen: KeyframeMotion, frame: FrameInput) -> KeyframeLink | FusionVerdict:
+    def _link(self, odometry: Odometry, seen: KeyframeMotion, frame: FrameInput) -> LinkMeasurement | FusionVerdict:
         state = self._state
         if state.mode is CovarianceMode.JACOBIAN:  # the gate needs marginals, which a hot computer does without
             return refused(odometry, Verdict.THROTTLED)
@@ -196,7 +196,7 @@ class OdometryMeasurement:
             return refused(odometry, Verdict.STALE)
         if state.fragments.of(answer.parent) is not state.fragments.of(seen.parent):
             return refused(odometry, Verdict.UNCONFIRMED)
-        return KeyframeLink(odometry.keyframe_id, answer.parent, answer.motion, seen.parent, seen.motion)
+        return LinkMeasurement(odometry.keyframe_id, answer.parent, answer.motion, seen.parent, seen.motion)
 
     def _first_motion(self, odometry: Odometry, frame: FrameInput) -> KeyframeMotion | Verdict:
         """Motion since the keyframe, or since the first of the further keyframes that tells one; or why there is
@@ -218,9 +218,9 @@ class OdometryMeasurement:
             return Verdict.STALE
         keyframe = state.graph.state(parent)
         p = keyframe.pose.translation()
-        view = KeyframeView(keyframe.pose, state.covariances.recent_pose(parent), state.terrain.elevation_m(p))
+        view = KeyframeView(keyframe.pose, state.covariances.recorded_pose(parent), state.terrain.elevation_m(p))
         newest = state.graph.state(state.graph.newest)
-        onward = newest.velocity[:3] * (odometry.t_ns * 1e-9 - state.graph.time_of(state.graph.newest))
+        onward = newest.motion[:3] * (odometry.t_ns * 1e-9 - state.graph.time_of(state.graph.newest))
         way_m = float(np.hypot(*(newest.pose.translation() + onward - p)[:2]))
         motion = plane_motion(state, view, odometry, self._expected_rotation(frame, keyframe), way_m)
         if isinstance(motion, Verdict):
@@ -234,6 +234,6 @@ class OdometryMeasurement:
         r_w_kf = keyframe.pose.rotation().matrix()
         if frame.attitude.pitch_rad is None or frame.attitude.roll_rad is None:
             return r_w_kf, UNKNOWN_ATTITUDE_RAD
-        r_w_k = self._state.camera.expected(frame.attitude, keyframe.bias, r_w_kf)
+        r_w_k = self._state.camera.expected(frame.attitude, keyframe.calibration, r_w_kf)
         tilt_rad = np.radians(max(self._state.origin.attitude_sigma_deg, 1.0))
         return r_w_k, float(np.hypot(tilt_rad, frame.attitude.stale * UNKNOWN_ATTITUDE_RAD))

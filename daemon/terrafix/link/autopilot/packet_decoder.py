@@ -18,7 +18,7 @@ ATTITUDE_TIMEOUT_NS = 500_000_000  # an older attitude is not used for the outpu
 COMMON_EKF_FLAGS = 2 * mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS - 1
 
 
-class AutopilotPeer:
+class PacketDecoder:
     """Processes the messages of the served autopilot (served_autopilot.py)."""
 
     def __init__(self, timesync: TimeSync) -> None:

@@ -11,9 +11,9 @@ from terrafix.anchor.matching.frame_matcher import (
     MAX_FINE_HYPOTHESES,
     MAX_HYPOTHESES,
     CorrelationResult,
-    Fix,
     FrameMatcher,
     Hypothesis,
+    PatchFix,
     View,
     _hypotheses,
 )
@@ -182,7 +182,7 @@ class PartlyKnownDem(SlopedMap):
         return np.where(e_m < TRUE_M[0], np.nan, super().elevation(e_m, n_m))
 
 
-def fix_over_slope(ground: np.ndarray, world: SlopedMap) -> tuple[Fix, View, np.ndarray]:
+def fix_over_slope(ground: np.ndarray, world: SlopedMap) -> tuple[PatchFix, View, np.ndarray]:
     """The fix with a plane through the ground below the camera as the prediction, that prediction, and the true
     position (3,), AGL_M above the slope."""
     below_m = float(np.dot(SLOPE, TRUE_M[:2]))

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from map_matches import pose_of
-from terrafix.anchor.matching.frame_matcher import Fix, View
+from terrafix.anchor.matching.frame_matcher import PatchFix, View
 from terrafix.anchor.matching.match_message import mode_match, pose_match, relocalized_match
 from terrafix.anchor.matching.point_mass_filter import Mode
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.core.pnp import INLIER_THRESHOLD, MIN_INLIERS, SEARCH_RADIUS, map_pose, solve, solved
+from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, SEARCH_RADIUS, map_pose, solve, solved
 from terrafix.core.pose import PoseFit
 from terrafix.messages import MapMatch, MatchPlace, PnpInput, Verdict
 
@@ -24,7 +24,7 @@ GIVEN = PnpInput(
     sigma_floor=0.0015,
     threshold=INLIER_THRESHOLD,
     search_radius=SEARCH_RADIUS,
-    min_inliers=MIN_INLIERS,
+    min_inliers=PNP_MIN_INLIERS,
 )
 BEFORE = MapMatch(
     t_ns=0, frame_id=3, verdict=Verdict.LOST, matcher="gradient", place=MatchPlace(e_m=0.0, n_m=0.0, mass=0.95)
@@ -32,7 +32,7 @@ BEFORE = MapMatch(
 COUNT, WRONG = 30, 4
 
 
-def fix_of(given: PnpInput | None) -> tuple[Fix, PoseFit]:
+def fix_of(given: PnpInput | None) -> tuple[PatchFix, PoseFit]:
     """A fix with ``WRONG`` of ``COUNT`` matches at other places, and its pose. ``given`` None: of another method."""
     rng = np.random.default_rng(4)
     points = np.column_stack([rng.uniform(-50.0, 50.0, (COUNT, 2)), rng.uniform(48.0, 52.0, COUNT)])
@@ -42,7 +42,7 @@ def fix_of(given: PnpInput | None) -> tuple[Fix, PoseFit]:
     weights = rng.uniform(0.5, 1.0, COUNT)
     found = solve(points, xy, weights, GIVEN)
     assert found.fit is not None and found.inliers.sum() == COUNT - WRONG
-    return Fix(xy, points, weights, found, 0.5, given), found.fit
+    return PatchFix(xy, points, weights, found, 0.5, given), found.fit
 
 
 def test_the_position_of_a_mode_carries_nothing_of_a_pose_that_was_rejected_there() -> None:

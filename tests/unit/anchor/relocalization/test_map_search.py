@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
-from terrafix.anchor.relocalization.hypothesis_tracker import (
+from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.verification.hypothesis_tracker import (
     CLEAR_LEAD,
     CONFIRMATION_LLR,
     DECISION_MARGIN,
     LEAD_WINDOW,
-    LLR_MAX,
-    LLR_MIN,
     MIN_CONFIRMATIONS,
     NEIGHBOUR_RADIUS,
     NEW_EVIDENCE,
+    TRACK_LLR_MAX,
+    TRACK_LLR_MIN,
     AcceptedPlace,
     HypothesisTracker,
     PlaceHypothesis,
     _mahalanobis2,
     evidence,
 )
-from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.verification.lock_monitor import MAX_LOG_ODDS, LockMonitor, pose_gain
 from terrafix.anchor.verification.patch_consensus import PatchConsensus
 from terrafix.anchor.verification.patch_null import COARSE_NULL, PRIOR_PLACES, REFERENCE_PATCHES, PatchNull
@@ -279,7 +279,7 @@ def track_of(
         ),  # the wide joint correlation is the second confirmation
         # joint correlations alone are not enough
         (track_of(ENOUGH + 0.1, leads=(2.0,), frames=0, wide=True), [], False),
-        (track_of(LLR_MIN, leads=(5.0, 5.0), frames=0), [], False),
+        (track_of(TRACK_LLR_MIN, leads=(5.0, 5.0), frames=0), [], False),
         (track_of(ENOUGH - 2.0, leads=(1.0, 1.0)), [], True),
         (track_of(ENOUGH - 2.0, leads=(9.0,)), [], False),  # a single lead may be random
         (track_of(ENOUGH - 2.0, leads=(9.0, -1.0)), [], False),
@@ -299,11 +299,11 @@ def test_the_same_ground_counts_once() -> None:
     """Independent of the number of frames; evidence against a place also counts once."""
     track = PlaceHypothesis(0.0, 0.0, Hypothesis(0.0, 1.0))
     for i in range(11):
-        track.update_score(LLR_MAX, i * 0.1 * NEW_EVIDENCE * AGL_M, AGL_M)
-    assert track.score == pytest.approx(2.0 * LLR_MAX) and track.frames == 11
+        track.update_score(TRACK_LLR_MAX, i * 0.1 * NEW_EVIDENCE * AGL_M, AGL_M)
+    assert track.score == pytest.approx(2.0 * TRACK_LLR_MAX) and track.frames == 11
     for i in range(30):
-        track.update_score(LLR_MIN, (1 + i) * NEW_EVIDENCE * AGL_M, AGL_M)
-    assert track.score == LLR_MIN
+        track.update_score(TRACK_LLR_MIN, (1 + i) * NEW_EVIDENCE * AGL_M, AGL_M)
+    assert track.score == TRACK_LLR_MIN
 
 
 def test_a_frame_with_little_evidence_is_no_confirmation() -> None:
@@ -361,8 +361,8 @@ def test_a_consensus_at_the_level_of_the_null_model_is_no_evidence() -> None:
     def gain(llr: float, patches: int) -> float:
         return evidence(null.sigmas(of(llr, patches), fine=False))
 
-    assert gain(by_chance, REFERENCE_PATCHES) == LLR_MIN < 0.0 < gain(2.0 * by_chance, REFERENCE_PATCHES)
-    assert gain(40.0, REFERENCE_PATCHES) == LLR_MAX
+    assert gain(by_chance, REFERENCE_PATCHES) == TRACK_LLR_MIN < 0.0 < gain(2.0 * by_chance, REFERENCE_PATCHES)
+    assert gain(40.0, REFERENCE_PATCHES) == TRACK_LLR_MAX
     assert gain(0.25 * by_chance, REFERENCE_PATCHES // 4) < 0.0  # with fewer patches the null model is lower
     assert gain(by_chance, REFERENCE_PATCHES // 4) > gain(by_chance, REFERENCE_PATCHES)
 

@@ -6,10 +6,10 @@ import pytest
 
 from terrafix.anchor.verification.lock_monitor import (
     DOUBT_LOG_ODDS,
+    LOCK_NULL_GAIN,
     MAX_GAIN,
     MAX_LOG_ODDS,
     MIN_GAIN,
-    NULL_GAIN,
     START_LOG_ODDS,
     LockMonitor,
     has_wide_sigma,
@@ -42,8 +42,8 @@ def test_more_inliers_are_more_evidence(inliers: int, nats: float) -> None:
 
 
 def test_an_observation_counts_by_its_gain_above_the_null_hypothesis_within_bounds() -> None:
-    assert observed(NULL_GAIN + 0.7) == pytest.approx(0.7)
-    assert observed(NULL_GAIN - 0.2) == pytest.approx(-0.2)
+    assert observed(LOCK_NULL_GAIN + 0.7) == pytest.approx(0.7)
+    assert observed(LOCK_NULL_GAIN - 0.2) == pytest.approx(-0.2)
     assert observed(90.0) == pytest.approx(MAX_GAIN) == 2.0
     assert observed(-90.0) == pytest.approx(MIN_GAIN) == -0.4
 
@@ -51,12 +51,12 @@ def test_an_observation_counts_by_its_gain_above_the_null_hypothesis_within_boun
 def test_the_bounds_are_those_of_the_share_that_is_observed() -> None:
     assert observed(90.0, weight=0.25) == pytest.approx(0.25 * MAX_GAIN)
     assert observed(-90.0, weight=0.25, new=0.1) == pytest.approx(0.1 * MIN_GAIN)
-    assert observed(0.25 * NULL_GAIN, weight=0.25, new=0.1) == pytest.approx(0.0)
+    assert observed(0.25 * LOCK_NULL_GAIN, weight=0.25, new=0.1) == pytest.approx(0.0)
 
 
 def test_a_pose_counts_by_the_weight_of_its_observation() -> None:
-    assert observed(NULL_GAIN, inliers=20) == pytest.approx(6.0)
-    assert observed(0.5 * NULL_GAIN, weight=0.5, inliers=20) == pytest.approx(3.0)
+    assert observed(LOCK_NULL_GAIN, inliers=20) == pytest.approx(6.0)
+    assert observed(0.5 * LOCK_NULL_GAIN, weight=0.5, inliers=20) == pytest.approx(3.0)
 
 
 def test_a_start_outweighs_fourteen_full_observations_without_evidence_and_not_sixteen() -> None:

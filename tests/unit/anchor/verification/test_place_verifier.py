@@ -10,7 +10,7 @@ import pytest
 from map_matches import pose_of
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
 from terrafix.anchor.matching.match_message import relocalized_match
-from terrafix.anchor.relocalization.hypothesis_tracker import LLR_MAX, evidence
+from terrafix.anchor.verification.hypothesis_tracker import TRACK_LLR_MAX, evidence
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_CELL_PER_AGL, PlaceVerifier, VerifiedPlace
 from terrafix.messages import MapMatch, MatchPlace, Verdict
@@ -56,7 +56,7 @@ def test_the_right_place_has_full_evidence_and_the_right_pose(
     verifier: PlaceVerifier, image: np.ndarray, cell_per_agl: float
 ) -> None:
     found = verified_place(verifier, image, PROPOSED_VIEW, cell_per_agl)
-    assert evidence(PatchNull().sigmas(found.consensus, fine=cell_per_agl == FINE_CELL_PER_AGL)) == LLR_MAX
+    assert evidence(PatchNull().sigmas(found.consensus, fine=cell_per_agl == FINE_CELL_PER_AGL)) == TRACK_LLR_MAX
     pose = found.fix.pnp.fit
     assert pose is not None and found.fix.pnp.verdict is Verdict.ACCEPTED
     off_m = pose.p_c_in_w_m - HERE_M

@@ -11,15 +11,15 @@ import pytest
 from single_map_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, FrameMatcher, View
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.relocalization.hypothesis_tracker import (
-    LLR_MAX,
+from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.relocalization.relocalizer import mixed_sigma_m, unknown_sigma_m
+from terrafix.anchor.verification.hypothesis_tracker import (
     NEW_EVIDENCE,
+    TRACK_LLR_MAX,
     AcceptedPlace,
     HypothesisTracker,
     PlaceHypothesis,
 )
-from terrafix.anchor.relocalization.map_search import MapSearch
-from terrafix.anchor.relocalization.relocalizer import mixed_sigma_m, unknown_sigma_m
 from terrafix.anchor.verification.lock_monitor import MIN_GAIN
 from terrafix.anchor.verification.place_verifier import FINE_CELL_PER_AGL
 from terrafix.anchor.verification.probation import (
@@ -84,7 +84,7 @@ def test_the_evidence_of_one_frame_is_bounded(ground: np.ndarray) -> None:
     test = probation(ground)
     test.predict(0.5 * STRETCH_M)
     test.update(view(ground, PINHOLE, R, TRUE_M), HERE)
-    assert test.wrong_probability == pytest.approx(1.0 / (1.0 + math.exp(0.5 * LLR_MAX)))
+    assert test.wrong_probability == pytest.approx(1.0 / (1.0 + math.exp(0.5 * TRACK_LLR_MAX)))
 
 
 def test_the_same_ground_gives_no_evidence(ground: np.ndarray) -> None:

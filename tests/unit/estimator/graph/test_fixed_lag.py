@@ -68,5 +68,5 @@ def test_the_first_node_of_every_graph_has_a_factor_of_c_and_b() -> None:
     window = [set(factor.keys()) for factor, _ in graph._history._window]
     assert any({C(node), B(node)} <= keys for keys in window)
     assert np.allclose(graph.covariance(node), np.eye(6)) and np.allclose(
-        graph.bias_covariance(node), np.eye(CALIBRATION_SIZE)
+        graph.calibration_covariance(node), np.eye(CALIBRATION_SIZE)
     )

@@ -45,7 +45,7 @@ class Tree:
         state, noise = self.states[node], gtsam.noiseModel.Gaussian.Covariance(cov)
         if key is C:
             return gtsam.PriorFactorPose3(C(node), state.pose, noise)
-        return gtsam.PriorFactorVector(key(node), state.bias if key is B else state.velocity, noise)
+        return gtsam.PriorFactorVector(key(node), state.calibration if key is B else state.motion, noise)
 
     def extend(self, node: int, parent: int) -> None:
         """Not a measurement of ``parent``: pose and calibration by their change, V alone."""

@@ -9,6 +9,7 @@ import pytest
 
 from simulated_flight import ORIGIN, EstimatorRun, Flight, cov_of, error_m
 from terrafix.estimator.initialization import ResetReason
+from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.innovation_gate import FUSION_TIMEOUT_SAMPLES, InnovationGate
 from terrafix.estimator.measurements.heading import HEADING_GATE_SIGMAS
 from terrafix.estimator.measurements.height import HEIGHT_GATE_SIGMAS
@@ -91,11 +92,11 @@ def test_wrong_initial_heights_are_replaced_by_later_consistent_ones(
 
 
 def test_after_the_time_out_without_a_map_fix_a_rejected_reading_is_accepted() -> None:
-    gate, samples = InnovationGate(HEIGHT_GATE_SIGMAS), FUSION_TIMEOUT_SAMPLES
-    far_m = 1.01 * HEIGHT_GATE_SIGMAS * 5.0
-    assert [gate.rejects(far_m, 5.0, 1.0) for _ in range(samples + 1)] == [True] * samples + [False]
-    assert not gate.rejects(0.99 * HEIGHT_GATE_SIGMAS * 5.0, 5.0, 1.0)
-    assert all(gate.rejects(far_m, 5.0, float(i)) for i in range(3 * samples))  # map fixes confirm the estimate
+    gate, samples = InnovationGate("height"), FUSION_TIMEOUT_SAMPLES
+    far, near = (Innovation.scalar(off * HEIGHT_GATE_SIGMAS * 5.0, 5.0, HEIGHT_GATE_SIGMAS) for off in (1.01, 0.99))
+    assert [gate.rejection(far, 1.0) is not None for _ in range(samples + 1)] == [True] * samples + [False]
+    assert gate.rejection(near, 1.0) is None
+    assert all(gate.rejection(far, float(i)) for i in range(3 * samples))  # map fixes confirm the estimate
 
 
 def test_a_wrong_initial_heading_is_replaced_by_the_second_one() -> None:

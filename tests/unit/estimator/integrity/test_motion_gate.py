@@ -22,8 +22,8 @@ def innovation(residual_m: float, dt_s: float = 0.5, *, inertial: bool) -> Motio
 @pytest.mark.parametrize(("inertial", "manoeuvre_mps2"), [(False, 40.0), (True, 5.0)])
 def test_a_motion_passes_up_to_the_gate_beyond_the_hardest_manoeuvre(inertial: bool, manoeuvre_mps2: float) -> None:
     limit_m = 0.5 * manoeuvre_mps2 * 0.5**2 + math.sqrt(GATE_D2) * SIGMA_M
-    assert innovation(0.99 * limit_m, inertial=inertial).passes_gate
-    assert not innovation(1.01 * limit_m, inertial=inertial).passes_gate
+    assert innovation(0.99 * limit_m, inertial=inertial).gated.is_accepted
+    assert not innovation(1.01 * limit_m, inertial=inertial).gated.is_accepted
 
 
 def test_the_gate_rejects_one_true_motion_in_a_million() -> None:
@@ -34,7 +34,7 @@ def test_the_gate_rejects_one_true_motion_in_a_million() -> None:
 
 def test_a_motion_within_the_hardest_manoeuvre_passes_at_any_covariance() -> None:
     sure = replace(innovation(0.5, inertial=False), cov_m2=0.01 * np.eye(3))
-    assert sure.passes_gate and sure.gated.mahalanobis2 == 0.0
+    assert sure.gated.is_accepted and sure.gated.mahalanobis2 == 0.0
 
 
 @pytest.mark.parametrize("inertial", [False, True])
@@ -46,8 +46,8 @@ def test_no_manoeuvre_is_allowed_for_a_standstill(inertial: bool) -> None:
 
 def test_a_wide_prediction_allows_a_large_motion() -> None:
     wide = MotionInnovation(np.array([40.0, 0.0, 0.0]), 10.0**2 * np.eye(3), 0.5, True)
-    assert wide.passes_gate
-    assert not replace(wide, cov_m2=np.eye(3)).passes_gate
+    assert wide.gated.is_accepted
+    assert not replace(wide, cov_m2=np.eye(3)).gated.is_accepted
 
 
 def test_a_moving_vehicle_with_a_static_picture_is_frozen_until_the_view_changes() -> None:

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
-from terrafix.anchor.relocalization.hypothesis_tracker import NEW_EVIDENCE
 from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.verification.hypothesis_tracker import NEW_EVIDENCE
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame

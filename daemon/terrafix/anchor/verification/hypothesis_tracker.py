@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import Fix, FrameMatcher, Hypothesis, View
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, PatchFix, View
 from terrafix.anchor.verification.patch_consensus import SCALE_SIGMA, YAW_SIGMA_RAD
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_CELL_PER_AGL, PlaceVerifier
@@ -27,11 +27,13 @@ MERGE_RADIUS = 0.2
 # standard deviations above the null model at which right and wrong places are equally frequent
 # [measured: docs/search.md]
 NULL_SIGMAS = 1.7
-LLR_SLOPE = 2.5  # nats per standard deviation beyond that: decay of the tail of wrong places [measured: docs/search.md]
+TRACK_LLR_SLOPE = (
+    2.5  # nats per standard deviation beyond that: decay of the tail of wrong places [measured: docs/search.md]
+)
 # Bounds of one frame's evidence, nats. At a quarter of the right places the patches are no better than the null model,
 # because much has changed or leans, and this persists from frame to frame. The upper bound limits repetitive ground:
 # one wrong place of about 200 searches came to 21, no other to more than 18. [measured: docs/search.md]
-LLR_MIN, LLR_MAX = -1.4, 9.0
+TRACK_LLR_MIN, TRACK_LLR_MAX = -1.4, 9.0
 NEW_EVIDENCE = 0.4  # share of the height: a frame over this much new ground is an independent observation [tuned]
 MIN_EVIDENCE_WEIGHT = 0.05  # weight of a frame over the same ground [tuned]
 MIN_SCORE = -1.0  # nats; a track whose score is lower is dropped for this ground [tuned]
@@ -115,14 +117,14 @@ class PlaceHypothesis:
         began."""
         new = float(np.clip((path_m - self.scored_path_m) / (NEW_EVIDENCE * agl_m), MIN_EVIDENCE_WEIGHT, 1.0))
         self.scored_path_m = path_m
-        self.score = max(self.score + new * evidence_nats, LLR_MIN)
+        self.score = max(self.score + new * evidence_nats, TRACK_LLR_MIN)
         self.frames += evidence_nats >= CONFIRMATION_LLR
 
 
 @dataclass(frozen=True)
 class AcceptedPlace:
     track: PlaceHypothesis
-    fix: Fix
+    fix: PatchFix
 
 
 class HypothesisTracker:
@@ -186,13 +188,13 @@ class HypothesisTracker:
             ground_m=view.ground_m if up is None or not np.isfinite(up[0]) else float(up[0]),
         )
 
-    def _update_track(self, track: PlaceHypothesis, image: Image, view: View, path_m: float) -> Fix | None:
+    def _update_track(self, track: PlaceHypothesis, image: Image, view: View, path_m: float) -> PatchFix | None:
         """Updates a track with the frame and moves it to the position that fits best. None: no evidence, or no pose."""
         here = self._view_at(track, view)
         is_strong = track.score > 0.0 or track.lead >= LEADING_SIGMAS
         found = self.verifier.verify(image, here, FINE_CELL_PER_AGL if is_strong else CELL_PER_AGL)
         if found is None:  # too little of the frame lies on the map
-            track.update_score(LLR_MIN, path_m, view.agl_m)
+            track.update_score(TRACK_LLR_MIN, path_m, view.agl_m)
             return None
         z = self.null.sigmas(found.consensus, fine=is_strong)
         self.sigmas.append(z)
@@ -231,4 +233,4 @@ def _mahalanobis2(hypothesis: Hypothesis, view: View) -> float:
 def evidence(z: float) -> float:
     """Log likelihood ratio "here against the best wrong places of a map" of a frame whose consensus is ``z`` standard
     deviations above the null model."""
-    return float(np.clip(LLR_SLOPE * (z - NULL_SIGMAS), LLR_MIN, LLR_MAX))
+    return float(np.clip(TRACK_LLR_SLOPE * (z - NULL_SIGMAS), TRACK_LLR_MIN, TRACK_LLR_MAX))
