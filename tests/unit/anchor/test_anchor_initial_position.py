@@ -16,7 +16,7 @@ from terrafix.link.node import LinkNode
 from terrafix.runtime.inbox import merge_predictions
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.in_process import InProcessShell
-from textured_ground import PINHOLE, texture, view
+from textured_ground import PINHOLE, view
 
 FRAME = LocalFrame(ORIGIN.lat_deg, ORIGIN.lon_deg)
 UNKNOWN = msgspec.structs.replace(ORIGIN, start_sigma_m=5000.0)
@@ -34,11 +34,6 @@ class Place(SingleMapPackage):
 
     def ground_amsl_m(self, _lat_deg: float, _lon_deg: float) -> float:
         return GROUND_M
-
-
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    return texture(8, SIDE_M)
 
 
 def anchor(ground: np.ndarray) -> tuple[AnchorNode, MemoryFrameStore]:

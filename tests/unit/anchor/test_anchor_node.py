@@ -39,11 +39,6 @@ from textured_ground import PINHOLE, texture, view
 CELL_M = 2.0  # of a belief
 
 
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    return texture(8, SIDE_M)
-
-
 def match(node: AnchorNode, frame_id: int, sigma_m: float, at_m: np.ndarray = TRUE_M, step_m: float = 0.0) -> MapMatch:
     answer, *_ = node.on(predicted(frame_id, sigma_m, at_m=at_m, step_m=step_m))
     assert isinstance(answer, MapMatch)

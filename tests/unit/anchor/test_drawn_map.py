@@ -7,13 +7,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
+from single_map_place import ORIGIN, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.matching.ncc import CorrelationWindow
 from terrafix.anchor.node import AnchorNode
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import MapMatch, SearchStep, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
-from textured_ground import PINHOLE, texture, view
+from textured_ground import PINHOLE, view
 
 STEP_M, FRAMES = 20.0, 11
 SEARCHED_M = 101.0  # 1-sigma of a start that is searched for
@@ -23,11 +23,6 @@ class DrawnMap(SingleMapPackage):
     manifest = SimpleNamespace(
         layers=(SimpleNamespace(table="drawn", ce90_m=6.0, ce90_origin=None, null_model=None, is_drawn=True),)
     )
-
-
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    return texture(8, SIDE_M)
 
 
 def started_on(ground: np.ndarray, start_sigma_m: float) -> tuple[AnchorNode, MemoryFrameStore]:

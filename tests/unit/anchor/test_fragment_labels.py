@@ -39,19 +39,33 @@ def steps(labels: FragmentLabels, *frames: tuple[MapMatch, Prediction]) -> list[
     return [labels.step_of(*frame) for frame in frames]
 
 
-def test_the_first_fragment_of_a_flight_is_no_step_and_each_later_one_is() -> None:
-    flown = [(match(), prediction(i, joined=i == 0)) for i in (0, 0, 1, 1, 2, 3)]
-    assert steps(FragmentLabels(), *flown) == [None, None, NEW, None, NEW, NEW]
-
-
-def test_a_step_that_is_not_well_known_is_no_new_fragment() -> None:
-    """The prediction has a step of 30 m, 1-sigma."""
-    assert steps(FragmentLabels(), *[(match(), prediction(0))] * 3) == [None] * 3
-
-
-def test_a_fragment_that_continues_an_older_one_is_not_new() -> None:
-    flown = [(match(), prediction(i, joined=False)) for i in (0, 1, 0, -1, 1)]
-    assert steps(FragmentLabels(), *flown) == [None, NEW, None, None, None]
+@pytest.mark.parametrize(
+    ("fragments", "expected"),
+    [
+        pytest.param(
+            [(0, True), (0, True), (1, False), (1, False), (2, False), (3, False)],
+            [None, None, NEW, None, NEW, NEW],
+            id="the first fragment of a flight is no step and each later one is",
+        ),
+        pytest.param([(0, True)] * 3, [None] * 3, id="a step with 30 m 1-sigma is no new fragment"),
+        pytest.param(
+            [(0, False), (1, False), (0, False), (-1, False), (1, False)],
+            [None, NEW, None, None, None],
+            id="a fragment that continues an older one is not new",
+        ),
+        pytest.param(
+            [(0, True), (1, False), (1, True), (1, True)],
+            [None, NEW, MERGE, None],
+            id="a fragment that the estimator has joined is merged without a map",
+        ),
+        pytest.param([(0, True), (1, False), (-1, True)], [None, NEW, None], id="a frame of no fragment merges none"),
+    ],
+)
+def test_fragments_without_a_pose_on_the_map_have_these_steps(
+    fragments: list[tuple[int, bool]], expected: list[SearchStep | None]
+) -> None:
+    flown = [(match(), prediction(i, joined=joined)) for i, joined in fragments]
+    assert steps(FragmentLabels(), *flown) == expected
 
 
 def test_the_first_frame_of_a_fragment_that_is_not_skipped_has_the_step() -> None:
@@ -68,16 +82,6 @@ def test_a_pose_on_the_map_merges_a_new_fragment_once_and_a_coarse_match_does_no
     open_fragment = prediction(1, joined=False)
     flown = [(match(), prediction(0)), (match(), open_fragment), (fixed, open_fragment), (fixed, open_fragment)]
     assert steps(FragmentLabels(), *flown) == [None, NEW, step, None]
-
-
-def test_a_fragment_that_the_estimator_has_joined_is_merged_without_a_map() -> None:
-    flown = [(match(), prediction(i, joined=joined)) for i, joined in ((0, True), (1, False), (1, True), (1, True))]
-    assert steps(FragmentLabels(), *flown) == [None, NEW, MERGE, None]
-
-
-def test_a_frame_of_no_fragment_merges_none() -> None:
-    flown = [(match(), prediction(i, joined=joined)) for i, joined in ((0, True), (1, False), (-1, True))]
-    assert steps(FragmentLabels(), *flown) == [None, NEW, None]
 
 
 def test_a_place_that_a_search_has_found_is_a_merge() -> None:

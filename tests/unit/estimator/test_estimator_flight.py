@@ -417,29 +417,6 @@ def test_a_place_that_was_found_late_is_carried_to_the_newest_frame() -> None:
     assert {run.verdicts("odometry")[i].verdict for i in range(45, 60)} == {Verdict.ACCEPTED}
 
 
-def test_a_match_of_a_frame_that_is_long_gone_is_stale() -> None:
-    flight = Flight(50, seed=1)
-    run = EstimatorRun().fly(flight, 0, 50)
-    run.feed([flight.fix(3)])
-    assert run.verdicts("map")[3].verdict is Verdict.STALE
-    run.feed([msgspec.structs.replace(flight.fix(49), frame_id=4711)])
-    assert run.verdicts("map")[4711].verdict is Verdict.STALE
-
-
-def test_a_match_that_comes_late_still_helps() -> None:
-    flight = Flight(46, seed=6)
-    run = EstimatorRun().fly(flight, 0, 28)
-    for i in range(28, 46):
-        run.feed(without_fix(flight.messages(i)))
-    before = sigma_m(run.estimate(45))
-    answers = run.feed([flight.fix(41)])  # the matcher took two seconds
-    assert run.verdicts("map")[41].verdict is Verdict.ACCEPTED
-    estimates = [m for m in answers if isinstance(m, NavEstimate)]
-    assert [m.frame_id for m in estimates] == [45]  # the newest frame, made better
-    assert sigma_m(estimates[0]) < 0.8 * before
-    assert estimates[0].last_anchor_age_ms == 2000
-
-
 @pytest.mark.parametrize("why", [Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.OUTSIDE_MAP])
 def test_what_the_anchor_refused_does_not_enter(why: Verdict) -> None:
     flight = Flight(30, seed=1)
@@ -481,25 +458,6 @@ def test_nothing_is_published_before_the_origin() -> None:
 
 
 # --- covariance modes -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_jacobian_claims_about_what_marginals_do() -> None:
-    long_flight = Flight(120, seed=3, dem=True)
-    cool, hot = EstimatorRun(), EstimatorRun()
-    cool.feed([health(ThermalBand.NORMAL)])
-    hot.feed([health(ThermalBand.HOT)])
-    for run in (cool, hot):
-        run.fly(long_flight, 0, 120)
-    assert {cool.estimate(i).covariance_mode for i in range(120)} == {CovarianceMode.MARGINALS}
-    assert {hot.estimate(i).covariance_mode for i in range(120)} == {CovarianceMode.JACOBIAN}
-    ratios = np.array([sigma_m(hot.estimate(i)) / sigma_m(cool.estimate(i)) for i in range(10, 120)])
-    assert ratios.min() > 0.5 and ratios.max() < 2.0
-    nees = []
-    for i in range(10, 120):
-        e, cov = error_m(hot.estimate(i), long_flight)[:2], cov_of(hot.estimate(i))[:2, :2]
-        nees.append(e @ np.linalg.solve(cov, e))
-    assert np.mean(nees) < 4.0
 
 
 def test_the_mode_changes_with_the_next_frame_and_back() -> None:

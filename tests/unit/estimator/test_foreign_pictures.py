@@ -62,6 +62,13 @@ def is_false(listener: EstimatorRun, flight: Flight, i: int) -> bool:
     return off_m > 50.0 and mahalanobis(listener, flight, i) > 3.0
 
 
+def lied_to(speed_mps: float = 45.0, turn_rad: float = 2.0, **other: Any) -> tuple[Flight, Flight, EstimatorRun]:
+    """-> a flight, another one whose pictures it shows from FIRST to END, and the run over it."""
+    flight = Flight(FRAMES, seed=5)
+    shown = Flight(FRAMES + LATER, seed=11, speed_mps=speed_mps, turn_rad=turn_rad, **other)
+    return flight, shown, flown({i: foreign(shown, i) for i in range(FIRST, END)}, flight)
+
+
 STARTED, FOUND = "first frame", "map match: found"  # reasons of a reset
 
 
@@ -72,18 +79,14 @@ def resets(run: EstimatorRun) -> dict[int, str]:
 
 @pytest.mark.parametrize("speed_mps", [3.0, 6.0, 12.0, 25.0, 45.0])
 def test_pictures_of_another_flight_cause_no_false_fix(speed_mps: float) -> None:
-    flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=speed_mps, turn_rad=2.0)
-    listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    flight, _, listener = lied_to(speed_mps)
     assert not any(is_false(listener, flight, i) for i in range(FIRST, FRAMES))
     assert listener.verdicts("odometry")[FRAMES - 1].verdict is Verdict.ACCEPTED
     assert np.linalg.norm(error_m(listener.estimate(FRAMES - 1), flight)[:2]) < 12.0
 
 
 def test_an_implausible_foreign_motion_is_not_fused() -> None:
-    flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, turn_rad=2.0)
-    listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    flight, _, listener = lied_to()
     verdicts = listener.verdicts("odometry")
     assert {verdicts[i].verdict for i in range(FIRST + 1, END)} <= {Verdict.UNCONFIRMED, Verdict.IMPLAUSIBLE}
     assert max(mahalanobis(listener, flight, i) for i in range(FIRST, FRAMES)) < 3.5
@@ -100,9 +103,7 @@ def test_a_fragment_that_turns_against_the_reported_heading_does_not_join() -> N
 
 
 def test_unconfirmed_motion_does_not_update_height_and_calibration() -> None:
-    flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=45.0, climb_amplitude_m=60.0)
-    lied = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    flight, _, lied = lied_to(turn_rad=0.0, climb_amplitude_m=60.0)
     dark = flown({i: blind(odometry_of(flight.messages(i))) for i in range(FIRST, END)}, flight)
     for i in range(FIRST, END):
         heights = [
@@ -169,16 +170,12 @@ def test_the_prediction_of_an_unjoined_fragment_covers_the_time_since_its_keyfra
         return innovation
 
     monkeypatch.setattr(OdometryMeasurement, "_innovation", spy)
-    flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=3.0, turn_rad=2.0)
-    flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    lied_to(3.0)
     assert len(beyond) > 5 and min(beyond) > 0.0
 
 
 def test_prediction_steps_follow_a_foreign_fragment_and_return_after_it() -> None:
-    flight = Flight(FRAMES, seed=5)
-    other = Flight(FRAMES + LATER, seed=11, speed_mps=25.0, turn_rad=2.0)
-    listener = flown({i: foreign(other, i) for i in range(FIRST, END)}, flight)
+    flight, other, listener = lied_to(25.0)
     steps = {m.frame_id: np.array(m.step_m) for m in listener.published if isinstance(m, Prediction)}
     theirs_m = np.linalg.norm(np.diff(other.p_m[FIRST + LATER : END + LATER, :2], axis=0), axis=1).sum()
     assert sum(np.linalg.norm(steps[i]) for i in range(FIRST + 1, END)) == pytest.approx(theirs_m, rel=0.1)
@@ -195,10 +192,15 @@ def frozen(flight: Flight, i: int) -> Odometry:
     )
 
 
-def test_a_frozen_camera_is_not_taken_for_a_stationary_vehicle() -> None:
+@pytest.fixture(scope="module")
+def frozen_run() -> tuple[Flight, EstimatorRun]:
+    """The last true picture is a keyframe."""
     flight = Flight(FRAMES, seed=7)
-    # The last true picture is a keyframe.
-    listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
+    return flight, flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
+
+
+def test_a_frozen_camera_is_not_taken_for_a_stationary_vehicle(frozen_run: tuple[Flight, EstimatorRun]) -> None:
+    flight, listener = frozen_run
     verdicts = listener.verdicts("odometry")
     assert all(verdicts[i].verdict is Verdict.STALLED for i in range(FIRST, END))
     assert max(mahalanobis(listener, flight, i) for i in range(FIRST, FRAMES)) < 3.5
@@ -206,9 +208,8 @@ def test_a_frozen_camera_is_not_taken_for_a_stationary_vehicle() -> None:
     assert np.linalg.norm(error_m(listener.estimate(END - 1), flight)[:2]) < 0.5 * way_m
 
 
-def test_no_prediction_is_published_for_a_frozen_picture() -> None:
-    flight = Flight(FRAMES, seed=7)
-    listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
+def test_no_prediction_is_published_for_a_frozen_picture(frozen_run: tuple[Flight, EstimatorRun]) -> None:
+    _, listener = frozen_run
     predicted = {m.frame_id for m in listener.published if isinstance(m, Prediction)}
     assert not predicted & set(range(FIRST, END))
     assert predicted >= {FIRST - 1, *range(END, FRAMES)}
@@ -265,9 +266,8 @@ def test_skipped_pictures_do_not_end_a_frozen_picture() -> None:
     assert [verdicts[i].verdict for i in (FIRST + 3, FIRST + 4)] == [Verdict.BAD_IMAGE, Verdict.STALLED]
 
 
-def test_the_step_covariance_after_stalled_frames_spans_all_of_them() -> None:
-    flight = Flight(FRAMES, seed=7)
-    listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
+def test_the_step_covariance_after_stalled_frames_spans_all_of_them(frozen_run: tuple[Flight, EstimatorRun]) -> None:
+    flight, listener = frozen_run
     odometry = {m.frame_id: m for m in listener.published if isinstance(m, Prediction)}
     truth_m = (flight.p_m[END] - flight.p_m[FIRST - 1])[:2]
     sigma = math.sqrt(odometry[END].step_cov_m2[0])
@@ -323,12 +323,16 @@ def found_at_15_m(fix: MapMatch) -> MapMatch:
     return with_search(with_pose(fix, p_c_in_w_m=(*position_of(fix)[:2], 15.0)), relocalized=True)
 
 
+def run_at_15_m(flight: Flight) -> EstimatorRun:
+    """After 20 frames, the last of which a search has found too low."""
+    listener = EstimatorRun().fly(flight, 0, 20)
+    listener.feed([found_at_15_m(flight.fix(19))])
+    return listener
+
+
 def test_a_height_too_low_for_matching_is_reset_to_the_reported_one() -> None:
     flight = Flight(30, seed=3, dem=True)
-    listener = EstimatorRun().fly(flight, 0, 20)
-    fix = flight.fix(19)
-    low = found_at_15_m(fix)
-    listener.feed([low])
+    listener = run_at_15_m(flight)
     assert listener.estimate(19).agl_m < 20.0
     listener.feed(without(flight.messages(20), MapMatch))
     assert list(resets(listener).items())[:2] == [(0, STARTED), (19, FOUND)]
@@ -339,23 +343,20 @@ def test_a_height_too_low_for_matching_is_reset_to_the_reported_one() -> None:
     assert list(resets(listener)) == [0, 19, 20]
 
 
-@pytest.mark.parametrize("reported_m", [20.0, 40.0])
-def test_a_reported_height_near_the_matching_limit_causes_no_reset(reported_m: float) -> None:
-    flight = Flight(25, seed=3, dem=True)
-    listener = EstimatorRun().fly(flight, 0, 20)
-    fix = flight.fix(19)
-    listener.feed([found_at_15_m(fix)])
+@pytest.mark.parametrize(
+    ("dem", "reported_m"),
+    [
+        pytest.param(True, 20.0, id="reported below the matching limit"),
+        pytest.param(True, 40.0, id="reported a little above the matching limit"),
+        pytest.param(False, None, id="without an elevation map, whatever is reported"),
+    ],
+)
+def test_a_low_height_causes_no_reset(dem: bool, reported_m: float | None) -> None:
+    flight = Flight(25, seed=3, dem=dem)
+    listener = run_at_15_m(flight)
     state = next(m for m in flight.messages(20) if isinstance(m, VehicleState))
-    listener.feed([msgspec.structs.replace(state, agl_m=reported_m), odometry_of(flight.messages(20))])
-    assert listener.estimate(20).agl_m < 25.0 and resets(listener) == {0: STARTED, 19: FOUND}
-
-
-def test_without_an_elevation_map_a_low_height_causes_no_reset() -> None:
-    flight = Flight(25, seed=3)
-    listener = EstimatorRun().fly(flight, 0, 20)
-    fix = flight.fix(19)
-    listener.feed([found_at_15_m(fix)])
-    listener.feed(without(flight.messages(20), MapMatch))
+    state = state if reported_m is None else msgspec.structs.replace(state, agl_m=reported_m)
+    listener.feed([state, odometry_of(flight.messages(20))])
     assert listener.estimate(20).agl_m < 25.0 and resets(listener) == {0: STARTED, 19: FOUND}
 
 
@@ -371,8 +372,7 @@ def test_the_height_after_a_reset_is_the_reported_one_above_the_take_off() -> No
             if i < 20 or not isinstance(m, MapMatch):
                 listener.feed([m])
         if i == 19:
-            fix = flight.fix(19)
-            listener.feed([found_at_15_m(fix)])
+            listener.feed([found_at_15_m(flight.fix(19))])
     assert list(resets(listener)) == [0, 19, 20]
     assert listener.estimate(20).agl_m == pytest.approx(flight.p_m[20, 2], abs=15.0)
 

@@ -1,6 +1,5 @@
 """Map matches that come late and out of order: each belongs to its own frame, and none is lost or counted twice."""
 
-import math
 from itertools import pairwise
 
 import msgspec
@@ -9,7 +8,6 @@ import pytest
 
 from map_matches import plane, with_search
 from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m, sigma_m, t_ns
-from terrafix.estimator.integrity.correlated_fixes import MAX_FIXES, CorrelatedFixes
 from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, SourceEnded, SourceLabel, Verdict
 
 LATEST = 4  # frames: two seconds
@@ -75,13 +73,15 @@ def test_covariance_is_consistent_while_matches_are_late() -> None:
     assert 0.4 < np.mean(nees) < 3.0  # 2 would be exact; neighbours share their errors
 
 
-def test_a_match_of_an_old_frame_publishes_the_newest_position() -> None:
+def test_a_match_of_an_old_frame_publishes_the_newest_position_and_improves_it() -> None:
     flight = Flight(40, seed=2)
-    run = EstimatorRun().fly(flight, 0, 35)
-    for i in range(35, 40):
+    run = EstimatorRun().fly(flight, 0, 28)
+    for i in range(28, 40):
         run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
+    before = sigma_m(run.estimate(39))
     estimates = [m for m in run.feed([flight.fix(37)]) if isinstance(m, NavEstimate)]
     assert [(m.frame_id, m.t_ns, m.emitted_at_ns) for m in estimates] == [(39, t_ns(39), t_ns(39))]
+    assert run.verdicts("map")[37].verdict is Verdict.ACCEPTED and sigma_m(estimates[0]) < 0.8 * before
     assert estimates[0].last_anchor_age_ms == 1000
     older = [m for m in run.feed([flight.fix(35)]) if isinstance(m, NavEstimate)]
     assert [m.last_anchor_age_ms for m in older] == [1000]  # the newest fix is still that of frame 37
@@ -130,6 +130,8 @@ def test_a_match_that_has_left_the_window_is_stale_and_changes_nothing() -> None
     answers = run.feed([flight.fix(20)])
     assert run.verdicts("map")[20].verdict is Verdict.STALE
     assert not any(isinstance(m, NavEstimate) for m in answers) and run.estimate(59) == before
+    run.feed([msgspec.structs.replace(flight.fix(59), frame_id=4711)])  # of a frame that never was
+    assert run.verdicts("map")[4711].verdict is Verdict.STALE
 
 
 def test_a_match_after_the_end_of_the_flight_is_stale() -> None:
@@ -141,38 +143,3 @@ def test_a_match_after_the_end_of_the_flight_is_stale() -> None:
     answers = run.feed([flight.fix(59)])
     assert run.verdicts("map")[59].verdict is Verdict.STALE
     assert not any(isinstance(m, NavEstimate) for m in answers)
-
-
-def test_ground_counts_the_same_in_any_order() -> None:
-    places = [np.array([20.0 * i, 0.0]) for i in range(4)]
-    for order in ((0, 1, 2, 3), (0, 2, 1, 3), (3, 1, 0, 2), (3, 2, 1, 0)):
-        seen, total_m = CorrelatedFixes(), 0.0
-        for i in order:
-            total_m += seen.new_ground_m(float(i), places[i], 50.0)
-            seen.add(float(i), places[i])
-        assert total_m == pytest.approx(50.0 + 60.0)  # the first, and all the way; no step is longer than what counts
-    assert seen.newest_s == 3.0
-    assert seen.new_ground_m(1.0, places[1], 50.0) == 0.0
-
-
-def test_ground_far_away_is_all_new() -> None:
-    seen = CorrelatedFixes()
-    assert seen.new_ground_m(0.0, np.zeros(2), 50.0) == 50.0 and seen.newest_s is None
-    for i in range(3 * MAX_FIXES):
-        seen.add(float(i), np.array([100.0 * i, 0.0]))
-    assert seen.new_ground_m(500.0, np.array([1e5, 0.0]), 50.0) == 50.0
-    assert seen.new_ground_m(500.0, np.array([1e5, 0.0]), math.inf) > 8e4
-    assert len(seen._fixes) == MAX_FIXES
-
-
-@pytest.mark.parametrize("hz", [0.5, 2.0, 5.0, 30.0])
-def test_more_frames_a_second_over_the_same_ground_add_no_information(hz: float) -> None:
-    """A vehicle that hovers for half a minute, 100 m up, after its first fix."""
-    seen, counted = CorrelatedFixes(), 0.0
-    seen.add(0.0, np.zeros(2))
-    for t_s in np.arange(1, 30 * hz) / hz:
-        counted += seen.information_share(float(t_s), np.zeros(2), 100.0)
-        seen.add(float(t_s), np.zeros(2))
-    assert counted == pytest.approx(30 * min(0.2, 0.1 * hz), rel=0.1)
-    assert seen.information_share(30.0, np.array([25.0, 0.0]), 100.0) == pytest.approx(0.5)  # half of its ground is new
-    assert seen.information_share(30.0, np.array([80.0, 0.0]), 100.0) == 1.0

@@ -396,8 +396,3 @@ def test_without_pyarrow_one_line_states_what_to_install(records: Path, tmp_path
     done = subprocess.run([sys.executable, "-c", code, *command[3:]], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert done.stderr == "terrafix: this command needs pyarrow; install it: pip install 'terrafix[ground]'\n"
-
-
-def test_the_list_of_records_survives_an_unfinished_line(tmp_path: Path) -> None:
-    (tmp_path / LIST).write_bytes(b'{"record":"a","size":1,"modified_ns":2,"flights":[]}\n{"rec')
-    assert list(FleetFolder(tmp_path).listed) == ["a"]

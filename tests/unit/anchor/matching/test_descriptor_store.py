@@ -7,14 +7,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
+from single_map_place import ORIGIN, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.matching.descriptor_cache import MapFeatures
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.node import AnchorNode
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import MapMatch
 from terrafix_engines.features.gradient import GradientDescriber
-from textured_ground import PINHOLE, texture, view
+from textured_ground import PINHOLE, view
 
 WINDOW = (-60.0, 60.0, 200, 200, 0.5)
 
@@ -29,11 +29,6 @@ class ReadMap(SingleMapPackage):
     def window(self, *of: Any) -> tuple[np.ndarray, np.ndarray]:
         self.reads += 1
         return super().window(*of)
-
-
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    return texture(8, SIDE_M)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anchor_rig import started
-from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
+from single_map_place import ORIGIN, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.node import AnchorNode
 from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.relocalization.position_prior import (
@@ -30,17 +30,12 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix_engines.features.gradient import GradientDescriber
-from textured_ground import PINHOLE, texture, view
+from textured_ground import PINHOLE, view
 
 FRAME = LocalFrame(ORIGIN.lat_deg, ORIGIN.lon_deg)
 BOUNDS = (-10_000.0, -10_000.0, 10_000.0, 10_000.0)
 KNOWN = CurrentBelief(0.0, 0.0, 10.0, MAX_LOG_ODDS)
 START = CurrentBelief(0.0, 0.0, 10.0, START_LOG_ODDS - 0.1)
-
-
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    return texture(8, SIDE_M)
 
 
 @pytest.mark.parametrize(

@@ -404,13 +404,22 @@ def test_a_start_without_evidence_is_lost_after_some_observations() -> None:
     assert 12 <= observations <= 20
 
 
-@pytest.mark.parametrize("weight", [0.1, 1.0])
-def test_observations_at_the_right_place_keep_the_lock(weight: float) -> None:
-    """Without a pose: the evidence of the frames is enough."""
+@pytest.mark.parametrize(
+    ("count", "observation"),
+    [
+        pytest.param(200, (4.0, 1.0, 1.0, 0, 10.0), id="at the right place without a pose"),
+        pytest.param(200, (0.4, 0.1, 0.1, 0, 10.0), id="at the right place with a low weight"),
+        pytest.param(300, (-0.2, 0.08, 0.0, 0, 10.0), id="of one field again and again"),
+        pytest.param(60, (-3.0, 1.0, 1.0, 0, 80.0), id="against a position with a large sigma"),
+    ],
+)
+def test_these_observations_keep_the_lock(count: int, observation: tuple[float, float, float, int, float]) -> None:
+    """``observation``: evidence, weight, share of new ground, inliers of the pose, sigma."""
     monitor = LockMonitor()
-    for _ in range(200):
-        monitor.update(4.0 * weight, weight, weight, 0, 10.0, AGL_M)
+    for _ in range(count):
+        monitor.update(*observation, AGL_M)
         assert not monitor.lost
+    assert monitor.wrong_probability == 0.0
 
 
 def test_poses_keep_the_lock_over_ground_without_texture_for_a_limited_time() -> None:
@@ -423,13 +432,6 @@ def test_poses_keep_the_lock_over_ground_without_texture_for_a_limited_time() ->
         monitor.update(-3.0, 1.0, 1.0, 0, 10.0, AGL_M)
         poor += 1
     assert 40 <= poor <= 60
-
-
-def test_repeated_observations_of_one_field_are_no_evidence_against_the_position() -> None:
-    monitor = LockMonitor()
-    for _ in range(300):
-        monitor.update(-0.2, 0.08, 0.0, 0, 10.0, AGL_M)
-    assert not monitor.lost and monitor.wrong_probability == 0.0
 
 
 def test_the_wrong_probability_is_reported_from_five_per_cent_on() -> None:
@@ -446,13 +448,6 @@ def test_the_wrong_probability_is_reported_from_five_per_cent_on() -> None:
         and probabilities == sorted(probabilities)
         and probabilities[-1] > 0.5
     )
-
-
-def test_a_position_with_a_large_sigma_is_not_lost() -> None:
-    monitor = LockMonitor()
-    for _ in range(60):
-        monitor.update(-3.0, 1.0, 1.0, 0, 80.0, AGL_M)
-    assert not monitor.lost
 
 
 def test_after_an_unobserved_path_the_log_odds_are_at_most_those_of_a_start() -> None:

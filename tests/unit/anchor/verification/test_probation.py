@@ -40,11 +40,6 @@ TENTH = Tail(above=1.0, share=0.1, count=1e6, excess=1e6)
 HERE = View(float(TRUE_M[0]), float(TRUE_M[1]), R, AGL_M, 0.0, 0.03, 0.02, 0.02)
 
 
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    return texture(8, SIDE_M)
-
-
 def probation(ground: np.ndarray) -> Probation:
     source: Any = SingleMapPackage(ground)
     return Probation(

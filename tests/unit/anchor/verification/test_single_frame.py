@@ -21,11 +21,6 @@ SHARE = FalseAlarmBudget().log_probability  # of the first frame
 NEAR_M = (7.0, -5.0)  # offset of the mode from the true position
 
 
-@pytest.fixture(scope="module")
-def ground() -> np.ndarray:
-    return texture(8, SIDE_M)
-
-
 class SameResult(CorrelationResult):
     """Every place fits best with the predicted yaw and scale."""
 

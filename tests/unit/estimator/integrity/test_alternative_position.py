@@ -83,18 +83,20 @@ def test_a_position_mapped_before_and_after_the_disagreement_is_wrong_only_if_tw
     assert (other.probability == 0.0) == fixed
 
 
-def test_a_position_after_a_switch_needs_one_repeating_pattern_only() -> None:
-    other, offset = AlternativePosition(), np.array([60.0, 0.0])
-    other.spawn([offset, offset], OFFSET_COV, fixed=True)
-    other.switch(offset, OFFSET_COV)
-    other.decay(0.0, NO_MASS)
-    assert other.probability == pytest.approx(INITIAL_PROBABILITY)
+def switched(offset_m: np.ndarray, *, fixed: bool = True) -> AlternativePosition:
+    """After two matches at ``offset_m`` that agree. ``fixed``: the map has placed the old position."""
+    other = AlternativePosition()
+    other.spawn([offset_m, offset_m], OFFSET_COV, fixed=fixed)
+    other.switch(offset_m, OFFSET_COV)
+    return other
 
 
 def test_a_previously_mapped_position_outlasts_half_a_minute_over_repeating_rows() -> None:
-    other, offset = AlternativePosition(), np.array([26.0, 45.0])
-    other.spawn([offset, offset], OFFSET_COV, fixed=True)
-    other.switch(offset, OFFSET_COV)
+    """One repeating pattern explains all matches since the switch."""
+    offset = np.array([26.0, 45.0])
+    other = switched(offset)
+    other.decay(0.0, NO_MASS)
+    assert other.probability == pytest.approx(INITIAL_PROBABILITY)
     for _ in range(30):
         other.decay(20.0 / 78.0, NO_MASS)
     assert mahalanobis2(inflated(other, ESTIMATE_COV), -offset) < 5.991
@@ -110,25 +112,23 @@ def test_below_the_reached_probability_the_offset_covariance_is_scaled_down() ->
 
 
 def test_an_unconfirmed_start_decays_faster_than_a_mapped_position() -> None:
-    unconfirmed, mapped = AlternativePosition(), AlternativePosition()
-    for other, fixed in ((unconfirmed, False), (mapped, True)):
-        other.spawn([np.array([200.0, 200.0])] * 2, OFFSET_COV, fixed=fixed)
-        other.switch(np.array([200.0, 200.0]), OFFSET_COV)
+    unconfirmed, mapped = (switched(np.array([200.0, 200.0]), fixed=fixed) for fixed in (False, True))
+    for other in (unconfirmed, mapped):
         other.decay(DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
     assert unconfirmed.probability == pytest.approx(INITIAL_PROBABILITY * np.exp(-1.0))
-    unconfirmed.decay(3.0 * DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
-    mapped.decay(3.0 * DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
+    for other in (unconfirmed, mapped):
+        other.decay(3.0 * DECAY_HEIGHTS * DECAY_FACTOR_START, NO_MASS)
     assert unconfirmed.probability == 0.0 and mapped.probability > 0.3
 
 
-def test_a_start_without_mass_in_the_belief_is_removed_without_new_ground() -> None:
+@pytest.mark.parametrize(
+    ("fixed", "after_70_percent", "after_all"), [(False, 0.3, 0.0), (True, INITIAL_PROBABILITY, INITIAL_PROBABILITY)]
+)
+def test_only_a_start_without_mass_in_the_belief_is_removed_without_new_ground(
+    fixed: bool, after_70_percent: float, after_all: float
+) -> None:
     """The belief began at the unconfirmed: its mass there is outside of the mode of the pose."""
-    unconfirmed, mapped = AlternativePosition(), AlternativePosition()
-    for other, fixed in ((unconfirmed, False), (mapped, True)):
-        other.spawn([np.array([200.0, 200.0])] * 2, OFFSET_COV, fixed=fixed)
-        other.switch(np.array([200.0, 200.0]), OFFSET_COV)
-        other.decay(0.0, 0.7)
-        assert other.probability == pytest.approx(INITIAL_PROBABILITY if fixed else 0.3)
-        other.decay(0.0, 0.995)
-    assert unconfirmed.probability == 0.0
-    assert mapped.probability == pytest.approx(INITIAL_PROBABILITY)
+    other = switched(np.array([200.0, 200.0]), fixed=fixed)
+    for mass, expected in ((0.7, after_70_percent), (0.995, after_all)):
+        other.decay(0.0, mass)
+        assert other.probability == pytest.approx(expected)

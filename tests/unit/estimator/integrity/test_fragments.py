@@ -44,32 +44,28 @@ def test_motion_as_predicted_confirms_a_fragment_after_two_consecutive_frames() 
     assert fragment.confirmed and CONFIRM_FRAMES == 2
 
 
-@pytest.mark.parametrize("inertial", [True, False])
-def test_motion_as_predicted_joins_a_fragment_only_by_inertial_readings(inertial: bool) -> None:
+@pytest.mark.parametrize(
+    ("off_m", "inertial", "frames", "step_s", "confirmed", "joined"),
+    [
+        pytest.param(0.1, True, 3, 0.5, True, True, id="as predicted by inertial readings: joined"),
+        pytest.param(0.1, False, 3, 0.5, True, False, id="as predicted without inertial readings: confirmed alone"),
+        pytest.param(6.0, True, 40, 1.0, True, False, id="against inertial readings: confirmed by its duration alone"),
+        pytest.param(6.0, False, 20, 0.5, False, False, id="as of another flight: neither"),
+    ],
+)
+def test_a_fragment_is_confirmed_and_joined_by_its_motion(
+    off_m: float, inertial: bool, frames: int, step_s: float, confirmed: bool, joined: bool
+) -> None:
     fragment = Fragment(0.0)
-    for i in range(3):
-        fragment.add_frame(0.5 * i, replace(evidence(0.1), inertial=inertial))
-    assert fragment.confirmed and fragment.joined is inertial
-
-
-def test_inertial_readings_that_contradict_the_motion_join_no_fragment() -> None:
-    fragment = Fragment(0.0)
-    for i in range(40):
-        fragment.add_frame(float(i), replace(evidence(6.0), inertial=True))
-    assert fragment.confirmed and not fragment.joined  # confirmed by its duration
+    for i in range(frames):
+        fragment.add_frame(step_s * i, replace(evidence(off_m), inertial=inertial))
+    assert (fragment.confirmed, fragment.joined) == (confirmed, joined)
 
 
 def test_a_confirmed_fragment_stays_confirmed() -> None:
     fragment = Fragment.joined_at(0.0)
     fragment.add_frame(0.5, evidence(6.0))
     assert fragment.confirmed
-
-
-def test_the_motion_of_another_flight_does_not_confirm_a_fragment() -> None:
-    fragment = Fragment(0.0)
-    for i in range(20):
-        fragment.add_frame(0.5 * i, evidence(6.0))
-    assert not fragment.confirmed
 
 
 def test_at_most_one_foreign_motion_in_20_supports_the_flight_by_chance() -> None:

@@ -1,7 +1,9 @@
 """Calibration monitors: alarms for wrong descriptions, none for correct ones, and the covariance inflation."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -11,7 +13,7 @@ from map_matches import with_pose
 from simulated_flight import ORIGIN, EstimatorRun, Flight, sigma_m, t_ns
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
-from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.monitors.calibration_monitors import FAULT_SIGMA_M, Monitors
 from terrafix.estimator.monitors.cusum import MARGIN, MAX_STEP, Cusum, threshold
 from terrafix.estimator.monitors.inertial import MIN_CHANGE_MPS, MIN_WINDOW_S, MOUNT_YAWS_DEG, InertialMonitor
@@ -252,14 +254,15 @@ def test_heights_in_feet_raise_a_scale_fault_and_withdraw_the_position() -> None
     assert sigma_m(listener.estimate(119)) >= FAULT_SIGMA_M
 
 
+def _unmatched(message: Message, matcher: str = "gradient") -> Message:
+    if not isinstance(message, MapMatch):
+        return message
+    return MapMatch(t_ns=message.t_ns, frame_id=message.frame_id, verdict=Verdict.AMBIGUOUS, matcher=matcher)
+
+
 @pytest.mark.slow
 def test_correlations_without_a_match_withdraw_the_position() -> None:
-    def nothing(message: Message) -> Message:
-        if not isinstance(message, MapMatch):
-            return message
-        return MapMatch(t_ns=message.t_ns, frame_id=message.frame_id, verdict=Verdict.AMBIGUOUS, matcher="gradient")
-
-    listener, faults = _fly(nothing, fix_every=1, frames=350)
+    listener, faults = _fly(_unmatched, fix_every=1, frames=350)
     assert [(fault.quantity, fault.active) for fault in faults] == [("registration", True)]
     assert sigma_m(listener.estimate(119)) >= FAULT_SIGMA_M
     assert sigma_m(listener.estimate(12)) > 50.0  # of 72 m
@@ -300,50 +303,37 @@ def test_correlations_over_ground_without_texture_are_ignored() -> None:
     def nothing(message: Message) -> Message:
         if isinstance(message, Odometry):
             return msgspec.structs.replace(message, verdict=Verdict.NO_FEATURES, two_view=[])
-        if isinstance(message, MapMatch):
-            return MapMatch(t_ns=message.t_ns, frame_id=message.frame_id, verdict=Verdict.AMBIGUOUS, matcher="gradient")
-        return message
+        return _unmatched(message)
 
     assert _fly(nothing, fix_every=1)[1] == []
 
 
 @pytest.mark.slow
 def test_correlations_with_a_drawn_map_do_not_count_against_registration() -> None:
-    def nothing(message: Message) -> Message:
-        if not isinstance(message, MapMatch):
-            return message
-        matcher = f"gradient{ON_DRAWN}"
-        return MapMatch(t_ns=message.t_ns, frame_id=message.frame_id, verdict=Verdict.AMBIGUOUS, matcher=matcher)
-
-    assert _fly(nothing, fix_every=1)[1] == []
+    assert _fly(partial(_unmatched, matcher=f"gradient{ON_DRAWN}"), fix_every=1)[1] == []
 
 
-def test_map_poses_identify_a_compass_error_of_90_degrees() -> None:
-    from terrafix.estimator.measurements.telemetry_buffer import Telemetry
-
-    monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(60, dem=True)
-    for i in range(60):
+def _heading_faults(frames: int, off_rad: Callable[[int], float]) -> list[CalibrationFault]:
+    """Changes of the faults in a flight whose reported heading is off by ``off_rad`` (frame), matched in each frame."""
+    monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(frames, dem=True)
+    faults = []
+    for i in range(frames):
         state, _, *_ = flight.messages(i)
         assert isinstance(state, VehicleState) and state.yaw_rad is not None
-        telemetry.add(msgspec.structs.replace(state, yaw_rad=state.yaw_rad + math.pi / 2))
+        telemetry.add(msgspec.structs.replace(state, yaw_rad=state.yaw_rad + off_rad(i)))
         monitors.on_map_match(flight.fix(i), telemetry, accepted=True)
-    faults = monitors.take_changes(t_ns(60))
-    assert [(fault.quantity, fault.active) for fault in faults] == [("heading", True)]
-    assert faults[0].factor == pytest.approx(90.0, abs=15.0)
-    assert monitors.take_changes(t_ns(61)) == []
+        faults += monitors.take_changes(t_ns(i))
+    return faults
+
+
+def test_map_poses_identify_a_compass_error_of_90_degrees_once() -> None:
+    (fault,) = _heading_faults(60, lambda _: math.pi / 2)
+    assert (fault.quantity, fault.active) == ("heading", True)
+    assert fault.factor == pytest.approx(90.0, abs=15.0)
 
 
 def test_a_fault_is_reported_again_when_its_factor_changes() -> None:
-    from terrafix.estimator.measurements.telemetry_buffer import Telemetry
-
-    monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(200, dem=True)
-    faults = []
-    for i in range(200):
-        state, _, *_ = flight.messages(i)
-        assert isinstance(state, VehicleState) and state.yaw_rad is not None
-        telemetry.add(msgspec.structs.replace(state, yaw_rad=state.yaw_rad + (1.5 if i < 100 else 3.0)))
-        monitors.on_map_match(flight.fix(i), telemetry, accepted=True)
-        faults += monitors.take_changes(t_ns(i))
+    faults = _heading_faults(200, lambda i: 1.5 if i < 100 else 3.0)
     assert all(fault.quantity == "heading" and fault.active for fault in faults)
     assert 2 <= len(faults) <= 5
     assert faults[0].factor == pytest.approx(86.0, abs=10.0) and faults[-1].factor == pytest.approx(172.0, abs=35.0)
