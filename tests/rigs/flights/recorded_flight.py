@@ -96,11 +96,6 @@ def errors(flight: Flight, graph: FlightGraph, smoothed: Smoothed) -> tuple[np.n
     return np.array(errors_m), np.array(covs)
 
 
-def nees(errors_m: np.ndarray, covs: np.ndarray) -> np.ndarray:
-    """-> (N,) squared Mahalanobis distances of the errors (N, 2)."""
-    return np.einsum("ni,ni->n", errors_m, np.linalg.solve(covs, errors_m[..., None])[..., 0])
-
-
 def seen_again(flight: Flight, keyframe: int, i: int, *, shown: int | None = None, fragment_id: int = 0) -> Message:
     """Frame i sees the ground of ``keyframe``; or, by mistake, that of the frame ``shown``."""
     rng = np.random.default_rng([keyframe, i])

@@ -96,7 +96,7 @@ def claims_of(replay: Path, truth_path: Path | None = None) -> Claims:
     errors, claimed, nees, information = [], [], [], []
     for c in located:
         d2 = mahalanobis2(c.row, c.error_e_m or 0.0, c.error_n_m or 0.0, math.sqrt(truth_m2))
-        if d2 is not None and c.row.sigma_e_m is not None and c.row.sigma_n_m is not None:
+        if math.isfinite(d2) and c.row.sigma_e_m is not None and c.row.sigma_n_m is not None:
             nees.append(d2)
             errors.append((c.error_e_m, c.error_n_m))
             information.append(_information(c.row, truth_m2))
