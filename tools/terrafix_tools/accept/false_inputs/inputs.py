@@ -21,7 +21,9 @@ from terrafix_tools.accept.measuring.results import Span
 
 FEET_IN_A_METRE = 3.28084
 NOISE_GREY = 2.0  # 1-sigma of a picture's noise from frame to frame, grey values: a small camera by day
+FOREIGN_LAG_S = 25.0  # longer than the span of a lie in the closed loop: no picture comes from the span itself
 FOCAL_SIGMA = 0.01  # stated relative 1-sigma of a wrong focal length
+SEED = 1  # of the choice of foreign and dropped frames, and of noise
 DOUBLED_SUFFIX = "again"  # appended to the file name of a doubled picture
 
 OriginEdit = Callable[[Origin], Origin]
@@ -55,7 +57,7 @@ def every_picture(change: Callable[[Image], Image]) -> Edit:
     return edit
 
 
-def stale_buffers(span: Span, buffers: int, *, noise_grey: float, seed: int) -> Edit:
+def stale_buffers(span: Span, buffers: int, *, noise_grey: float = NOISE_GREY, seed: int = SEED) -> Edit:
     """In ``span`` the camera delivers the last ``buffers`` pictures before it in turn, each with new noise.
 
     One buffer is a frozen camera. ``noise_grey``: 1-sigma of the noise in grey values; 0: identical pictures."""
@@ -76,8 +78,9 @@ def stale_buffers(span: Span, buffers: int, *, noise_grey: float, seed: int) -> 
     return edit
 
 
-def late_pictures(lag_s: float) -> Edit:
-    """Each frame shows the newest picture with an age of at least ``lag_s``; times and telemetry are unchanged."""
+def pictures_at(shown_ns: Callable[[int], int]) -> Edit:
+    """Each frame shows the newest picture that was taken at ``shown_ns(time of the frame)`` or before, at least the
+    first one; times and telemetry are unchanged. ``shown_ns`` does not decrease."""
 
     def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
         held: deque[tuple[int, Image]] = deque()
@@ -86,11 +89,33 @@ def late_pictures(lag_s: float) -> Edit:
                 yield shot
                 continue
             held.append((shot.frame.t_ns, shot.image))
-            while len(held) > 1 and held[1][0] <= shot.frame.t_ns - round(lag_s * 1e9):
+            while len(held) > 1 and held[1][0] <= shown_ns(shot.frame.t_ns):
                 held.popleft()
             yield replace(shot, image=held[0][1])
 
     return edit
+
+
+def late_pictures(lag_s: float) -> Edit:
+    """Each frame shows the newest picture with an age of at least ``lag_s``."""
+    return pictures_at(lambda t_ns: t_ns - round(lag_s * 1e9))
+
+
+def slow_pictures(span: Span, speed: float) -> Edit:
+    """In ``span`` the pictures play at ``speed`` (below 1) times the true one, so that their delay grows until the end
+    of the span."""
+    from_ns = round(span.from_s * 1e9)
+    return pictures_at(lambda t_ns: from_ns + round(speed * (t_ns - from_ns)) if span.has(t_ns / 1e9) else t_ns)
+
+
+def black(span: Span) -> Edit:
+    """Black pictures in ``span``: a covered lens, or night."""
+    return during(span, every_picture(np.zeros_like))
+
+
+def frozen(span: Span) -> Edit:
+    """In ``span`` the camera repeats the last picture before it."""
+    return stale_buffers(span, 1, noise_grey=0.0)
 
 
 def during(span: Span, edit: Edit) -> Edit:
@@ -104,24 +129,9 @@ def during(span: Span, edit: Edit) -> Edit:
     return edited
 
 
-def slow_pictures(span: Span, speed: float) -> Edit:
-    """In ``span`` the pictures play at ``speed`` (below 1) times the true one, so that their delay grows until the end
-    of the span. Times and telemetry are true."""
-
-    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
-        held: deque[tuple[float, Image]] = deque()
-        for shot in shots:
-            t_s = shot.frame.t_ns / 1e9
-            if shot.image is None or not span.has(t_s):
-                yield shot
-                continue
-            held.append((t_s, shot.image))
-            shown_s = span.from_s + speed * (t_s - span.from_s)
-            while len(held) > 1 and held[1][0] <= shown_s:
-                held.popleft()
-            yield replace(shot, image=held[0][1])
-
-    return edit
+def mirrored_before(span: Span) -> Edit:
+    """In ``span`` self-consistent pictures of another camera: the flight's own of FOREIGN_LAG_S before, mirrored."""
+    return during(span, lambda shots: every_picture(mirrored)(late_pictures(FOREIGN_LAG_S)(shots)))
 
 
 def partly_frozen(share: float, seed: int) -> Edit:
