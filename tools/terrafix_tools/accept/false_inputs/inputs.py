@@ -78,9 +78,8 @@ def stale_buffers(span: Span, buffers: int, *, noise_grey: float = NOISE_GREY, s
     return edit
 
 
-def pictures_at(shown_ns: Callable[[int], int]) -> Edit:
-    """Each frame shows the newest picture that was taken at ``shown_ns(time of the frame)`` or before, at least the
-    first one; times and telemetry are unchanged. ``shown_ns`` does not decrease."""
+def late_pictures(lag_s: float) -> Edit:
+    """Each frame shows the newest picture with an age of at least ``lag_s``; times and telemetry are unchanged."""
 
     def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
         held: deque[tuple[int, Image]] = deque()
@@ -89,23 +88,31 @@ def pictures_at(shown_ns: Callable[[int], int]) -> Edit:
                 yield shot
                 continue
             held.append((shot.frame.t_ns, shot.image))
-            while len(held) > 1 and held[1][0] <= shown_ns(shot.frame.t_ns):
+            while len(held) > 1 and held[1][0] <= shot.frame.t_ns - round(lag_s * 1e9):
                 held.popleft()
             yield replace(shot, image=held[0][1])
 
     return edit
 
 
-def late_pictures(lag_s: float) -> Edit:
-    """Each frame shows the newest picture with an age of at least ``lag_s``."""
-    return pictures_at(lambda t_ns: t_ns - round(lag_s * 1e9))
-
-
 def slow_pictures(span: Span, speed: float) -> Edit:
     """In ``span`` the pictures play at ``speed`` (below 1) times the true one, so that their delay grows until the end
-    of the span."""
-    from_ns = round(span.from_s * 1e9)
-    return pictures_at(lambda t_ns: from_ns + round(speed * (t_ns - from_ns)) if span.has(t_ns / 1e9) else t_ns)
+    of the span. Times and telemetry are true."""
+
+    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
+        held: deque[tuple[float, Image]] = deque()
+        for shot in shots:
+            t_s = shot.frame.t_ns / 1e9
+            if shot.image is None or not span.has(t_s):
+                yield shot
+                continue
+            held.append((t_s, shot.image))
+            shown_s = span.from_s + speed * (t_s - span.from_s)
+            while len(held) > 1 and held[1][0] <= shown_s:
+                held.popleft()
+            yield replace(shot, image=held[0][1])
+
+    return edit
 
 
 def black(span: Span) -> Edit:
