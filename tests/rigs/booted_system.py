@@ -20,7 +20,8 @@ from terrafix.messages import Camera, NavEstimate
 from terrafix.processes import PROCESSES
 from terrafix_tools.chaos.camera import Look, StreamedCamera, altered, camera_toml
 from terrafix_tools.chaos.scene import Scene
-from terrafix_tools.chaos.verdict import back_s, silence_s
+from terrafix_tools.chaos.verdict import back_s
+from terrafix_tools.score import longest_gap_s
 from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
@@ -91,7 +92,7 @@ class Surroundings:
 
     def silence_s(self, from_s: float) -> float:
         """Longest time without GPS_INPUT from ``from_s`` to now."""
-        return silence_s(self.peer.received_s, from_s, time.monotonic())
+        return longest_gap_s(self.peer.received_s, from_s, time.monotonic())
 
 
 def slower(scene: Scene, times: float, folder: Path) -> Scene:

@@ -14,17 +14,13 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.errors import EvaluationError, OutputError
-from terrafix.core.gate import CHI2_95
 from terrafix.core.toml_file import read_toml
 from terrafix.recorder.reader import ReadResult, check_format, is_record, read_flight
 from terrafix_tools.estimates import ESTIMATES, Row, RowTable, number, read_rows, read_table
 from terrafix_tools.finalise.output import TABLE as FINALISED
+from terrafix_tools.score import FALSE_FIX_ERROR_M, coverage, error_summary, is_false_fix, nees_of
 
 WEIGHTS_FREE = "gradient"  # beginning of MapMatch.matcher of a frame for which no learned model ran
-LIMITS_M = (5, 10, 20, 50)
-FALSE_FIX_ERROR_M = 50.0
-# "> 3 sigma": the squared Mahalanobis distance under the reported 2x2 covariance exceeds 3^2
-FALSE_FIX_MAHALANOBIS2 = 9.0
 _GEOD = Geod(ellps="WGS84")
 
 
@@ -44,7 +40,13 @@ class Compared:
     error_n_m: float | None
     error_m: float | None
     refined_error_m: float | None  # horizontal distance of the refined position
-    mahalanobis2: float | None  # squared, under the reported covariance; None also where that is not positive definite
+    mahalanobis2: float | None  # squared, under the reported covariance; inf where that is not positive definite
+
+    def is_false(self, beyond_m: float = FALSE_FIX_ERROR_M) -> bool:
+        """A frame without position is not false."""
+        if self.error_m is None or self.mahalanobis2 is None:
+            return False
+        return bool(is_false_fix(np.array(self.error_m), np.array(self.mahalanobis2), beyond_m))
 
 
 def read_truth(path: Path) -> dict[str, Truth]:
@@ -72,17 +74,15 @@ def offset_m(truth: Truth, lat_deg: float, lon_deg: float) -> tuple[float, float
     return distance_m * math.sin(azimuth), distance_m * math.cos(azimuth)
 
 
-def mahalanobis2(row: Row, e_m: float, n_m: float, extra_sigma_m: float = 0.0) -> float | None:
+def mahalanobis2(row: Row, e_m: float, n_m: float, extra_sigma_m: float = 0.0) -> float:
     """Squared Mahalanobis distance of (e_m, n_m) under the row's reported 2x2 covariance (plus ``extra_sigma_m``^2 on
-    the diagonal); None when that is not positive definite.
+    the diagonal); inf when that is not positive definite, or not reported.
     """
     if row.sigma_e_m is None or row.sigma_n_m is None or row.cov_en_m2 is None:
-        return None
-    ee, nn, en = row.sigma_e_m**2 + extra_sigma_m**2, row.sigma_n_m**2 + extra_sigma_m**2, row.cov_en_m2
-    det = ee * nn - en * en
-    if ee <= 0 or nn <= 0 or det <= 0:
-        return None
-    return (nn * e_m * e_m - 2 * en * e_m * n_m + ee * n_m * n_m) / det
+        return math.inf
+    extra_m2, across_m2 = extra_sigma_m**2, row.cov_en_m2
+    cov = np.array([[row.sigma_e_m**2 + extra_m2, across_m2], [across_m2, row.sigma_n_m**2 + extra_m2]])
+    return float(nees_of(np.array([[e_m, n_m]]), cov[None])[0])
 
 
 def compare(rows: list[Row], truth: dict[str, Truth]) -> list[Compared]:
@@ -100,25 +100,6 @@ def compare(rows: list[Row], truth: dict[str, Truth]) -> list[Compared]:
             refined_m = math.hypot(*offset_m(true, row.refined_lat_deg, row.refined_lon_deg))
         compared.append(Compared(row, true, e_m, n_m, error_m, refined_m, distance2))
     return compared
-
-
-def is_false_fix(compared: Compared, beyond_m: float = FALSE_FIX_ERROR_M) -> bool:
-    """True when the error exceeds ``beyond_m`` and 3 sigma of the reported covariance. A frame without position is not
-    false.
-    """
-    if compared.error_m is None or compared.error_m <= beyond_m:
-        return False
-    return compared.mahalanobis2 is None or compared.mahalanobis2 > FALSE_FIX_MAHALANOBIS2
-
-
-def _errors(errors_m: list[float], frames: int, prefix: str) -> dict[str, float | None]:
-    out: dict[str, float | None] = {
-        f"{prefix}within_{limit}m": sum(e <= limit for e in errors_m) / frames for limit in LIMITS_M
-    }
-    out[f"{prefix}median_m"] = float(np.median(errors_m)) if errors_m else None
-    out[f"{prefix}p95_m"] = float(np.percentile(errors_m, 95)) if errors_m else None
-    out[f"{prefix}max_m"] = max(errors_m) if errors_m else None
-    return out
 
 
 def _odometry_rate(summary: dict[str, Any]) -> float | None:
@@ -149,14 +130,15 @@ def metrics(
     located = [c for c in compared if c.error_m is not None]
     errors_m = [c.error_m for c in compared if c.error_m is not None]
     refined_m = [c.refined_error_m for c in compared if c.refined_error_m is not None]
-    nees = [c.mahalanobis2 for c in located if c.mahalanobis2 is not None]
+    nees = np.array([c.mahalanobis2 for c in located], dtype=np.float64)
+    valid = nees[np.isfinite(nees)]
     times_ms = [r.process_ms for r in rows if r.process_ms is not None]
     result: dict[str, Any] = {"frames": frames, "localised": len(located)}
-    result |= _errors(errors_m, frames, "") | _errors(refined_m, frames, "refined_")
+    result |= error_summary(errors_m, frames) | error_summary(refined_m, frames, "refined_")
     result |= {
-        "ellipse95_coverage": sum(v <= CHI2_95 for v in nees) / len(located) if located else None,
-        "mean_nees": float(np.mean(nees)) if nees else None,
-        "false_fixes": sum(is_false_fix(c) for c in located),
+        "ellipse95_coverage": coverage(nees),
+        "mean_nees": float(np.mean(valid)) if len(valid) else None,
+        "false_fixes": sum(c.is_false() for c in located),
         "anchor_rate": sum(c.row.anchor_age_ms == 0 for c in compared) / frames,
         "odometry_rate": _odometry_rate(summary),
         "model_rate": _model_rate(summary),
@@ -165,13 +147,12 @@ def metrics(
         # Additional to the specified metrics:
         "refined": len(refined_m),
         "frames_without_truth": len(rows) - frames,
-        "covariance_invalid": len(located) - len(nees),
+        "covariance_invalid": len(located) - len(valid),
     }
     if truth_sigma_m is not None:
         inflated = [mahalanobis2(c.row, c.error_e_m or 0.0, c.error_n_m or 0.0, truth_sigma_m) for c in located]
-        inside = sum(v is not None and v <= CHI2_95 for v in inflated)
         result["truth_sigma_m"] = truth_sigma_m
-        result["ellipse95_coverage_with_truth_sigma"] = inside / len(located) if located else None
+        result["ellipse95_coverage_with_truth_sigma"] = coverage(np.array(inflated))
     return {key: round(value, 6) if isinstance(value, float) else value for key, value in result.items()}
 
 

@@ -8,19 +8,15 @@ import msgspec
 import numpy as np
 
 from map_matches import plane
-from simulated_flight import CAMERA, FIX_SIGMAS, PAIRS, PLACE, ROOFS, SIGMA_NORM
+from simulated_flight import CAMERA, KEYFRAME_EVERY, PLACE, EstimatorRun, keyframe_of
 from simulated_flight import ORIGIN as STEADY_ORIGIN
+from simulated_flight import blind as without_features
 from terrafix.core.camera import Mount
-from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pose import exp_so3
-from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import (
     Health,
     Imu,
-    ImuSample,
     MapMatch,
-    MapPose,
-    MatchPlace,
     MeasurementVerdict,
     Message,
     NavEstimate,
@@ -31,14 +27,15 @@ from terrafix.messages import (
 )
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.items import Box
+from terrafix_tools.montecarlo.flown import imu_of
+from terrafix_tools.sim.interfaces import Readings
 from terrafix_tools.sim.sensors.suite import VehicleSensors
+from terrafix_tools.sim.true_messages import first_odometry, map_match, seen_from
 from terrafix_tools.sim.vehicle.plane import Plane
 from terrafix_tools.sim.vehicle.wind import Wind
-from textured_ground import apply, homography
 
 STEP_S, FRAME_EVERY, STATE_EVERY, BATCH = 0.02, 50, 2, 3
 FIX_EVERY = 4
-KEYFRAME_EVERY = 3
 ORIGIN = msgspec.structs.replace(STEADY_ORIGIN, yaw_sigma_deg=3.0, agl_sigma_m=3.0, attitude_sigma_deg=0.7)
 
 
@@ -61,7 +58,7 @@ class InertialFlight:
         self.velocity_mps: list[np.ndarray] = []
         self.messages_by_frame: list[list[Message]] = []
         telemetry: list[Message] = []
-        batch: list[tuple[int, np.ndarray]] = []
+        batch: list[Readings] = []
         for i in range(round(seconds / STEP_S)):
             state = plane.step(STEP_S, None) if i else plane.state
             readings, t_ns = sensors.read(state), round(state.t_s * 1e9)
@@ -78,10 +75,9 @@ class InertialFlight:
                         airspeed_mps=readings.airspeed_mps,
                     )
                 )
-            batch.append((t_ns, np.concatenate([readings.accel_b_mps2, readings.gyro_b_radps])))
+            batch.append(readings)
             if len(batch) == BATCH:
-                samples: list[ImuSample] = [(t_ns - at_ns, *values.tolist()) for at_ns, values in batch]
-                telemetry.append(Imu(t_ns=t_ns, source="simulated", samples=samples))
+                telemetry.append(imu_of(batch, "simulated"))
                 batch = []
             if i % frame_every == 0:
                 self.poses.append((state.r_w_b() @ mount, state.p_b_in_w_m - np.array([*start, 0.0])))
@@ -95,51 +91,25 @@ class InertialFlight:
 
     def _odometry(self, i: int, t_ns: int, rng: np.random.Generator) -> Odometry:
         if i == 0:
-            return Odometry(
-                t_ns=t_ns, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True, fragment_id=0
-            )
-        keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
-        return self.registered(i, keyframe, t_ns, rng, becomes_keyframe=i % KEYFRAME_EVERY == 0)
+            return first_odometry(t_ns)
+        return self.registered(i, keyframe_of(i), t_ns, rng, becomes_keyframe=i % KEYFRAME_EVERY == 0)
 
     def registered(
         self, i: int, keyframe: int, t_ns: int, rng: np.random.Generator, *, becomes_keyframe: bool
     ) -> Odometry:
         """Odometry of frame ``i`` against the frame ``keyframe``."""
-        keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
-        frame_xy = apply(homography(self.poses[keyframe], self.poses[i]), keyframe_xy) + rng.normal(
-            0.0, SIGMA_NORM, keyframe_xy.shape
-        )
         return Odometry(
             t_ns=t_ns,
             frame_id=i,
             keyframe_id=keyframe,
             verdict=Verdict.ACCEPTED,
-            two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
-            sigma_norm=SIGMA_NORM,
-            inliers=PAIRS,
-            tracked=PAIRS,
             becomes_keyframe=becomes_keyframe,
             fragment_id=0,
+            **seen_from(self.poses[keyframe], self.poses[i], rng),
         )
 
     def fix(self, i: int, t_ns: int, rng: np.random.Generator) -> MapMatch:
-        r_w_c, p_m = self.poses[i]
-        error = rng.normal(0.0, np.hypot(FIX_SIGMAS, [0.0, 0.0, ROOFS * p_m[2], 0.0, 0.0, 0.0]))
-        p = p_m + error[:3]
-        return MapMatch(
-            t_ns=t_ns,
-            frame_id=i,
-            verdict=Verdict.ACCEPTED,
-            matcher="gradient",
-            pose=MapPose(
-                p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-                q_w_c=quat_from_rot(exp_so3(error[3:]) @ r_w_c),
-                cov=tuple(float(v) for v in np.diag(FIX_SIGMAS**2).ravel()),
-            ),
-            inliers=30,
-            place=MatchPlace(e_m=float(p[0]), n_m=float(p[1]), mass=0.99),
-            ground=plane(0.0),
-        )
+        return map_match(t_ns, i, self.poses[i], rng, ground=plane(0.0))
 
 
 @dataclass(frozen=True)
@@ -171,12 +141,9 @@ def flown(
     ``imu``, ``airspeed``: the telemetry has them. ``blind``: frames (first, end) without tracked features and map
     match. ``no_imu``: interval (begin, end) [s] without inertial readings. ``iced``: scale factor of the airspeed
     sensor in the blind frames. ``no_camera``: frames (first, end) that are missing."""
-    node = EstimatorNode()
+    run = EstimatorRun()
     cause = Health(t_ns=0, band=band, temperature_c=60.0, throttled=False, disk_free_mb=1000, cause="test")
-    for message in (ORIGIN, cause):
-        assert list(node.on(message)) == []
-    last: dict[int, NavEstimate] = {}
-    verdicts: list[MeasurementVerdict] = []
+    assert run.feed([ORIGIN, cause]) == []
     for i, messages in enumerate(flight.messages_by_frame[:frames]):
         for message in _with_outages(messages, imu, range(*blind), i, no_imu):
             if isinstance(message, VehicleState):
@@ -184,12 +151,8 @@ def flown(
                 message = msgspec.structs.replace(message, airspeed_mps=read_mps if airspeed else None)
             if i in range(*no_camera) and isinstance(message, (Odometry, MapMatch)):
                 continue
-            for reply in node.on(message):
-                if isinstance(reply, NavEstimate):
-                    last[reply.frame_id] = reply
-                elif isinstance(reply, MeasurementVerdict):
-                    verdicts.append(reply)
-    rows = [last[i] for i in sorted(last)]
+            run.feed([message])
+    rows = run.estimates()
     errors_m = [np.array([*PLACE.to_local(e.lat_deg, e.lon_deg)]) - flight.poses[e.frame_id][1][:2] for e in rows]
     return Flown(
         rows,
@@ -197,7 +160,7 @@ def flown(
         np.sqrt(np.array([[e.cov[0], e.cov[7]] for e in rows])),
         np.array([e.velocity_enu_mps for e in rows]) - np.array([flight.velocity_mps[e.frame_id] for e in rows]),
         np.array([e.velocity_sigma_mps for e in rows]),
-        verdicts,
+        [m for m in run.published if isinstance(m, MeasurementVerdict)],
     )
 
 
@@ -210,7 +173,4 @@ def _with_outages(
             continue
         if i in blind and isinstance(message, MapMatch):
             continue
-        if i in blind and isinstance(message, Odometry):
-            yield Odometry(t_ns=message.t_ns, frame_id=i, keyframe_id=message.keyframe_id, verdict=Verdict.FEW_INLIERS)
-        else:
-            yield message
+        yield without_features(message) if i in blind and isinstance(message, Odometry) else message

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from inertial_flight import ORIGIN, STEP_S, InertialFlight
-from simulated_flight import CAMERA, PLACE
+from simulated_flight import CAMERA, PLACE, EstimatorRun
 from terrafix.core.limits import MAX_KEYFRAME_AGE, MAX_SENT_VELOCITY_SIGMA_MPS
-from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import MapMatch, MeasurementVerdict, Message, NavEstimate, Odometry, Verdict
 from terrafix.vision.feature_tracker import KEYFRAME_SHIFT
+from terrafix_tools.sim.true_messages import first_odometry
 
 FRAME_EVERY = 10  # steps: 5 frames a second
 FRAME_S = 0.2
@@ -78,14 +78,13 @@ class Flown:
 def fly(flight: InertialFlight, load: Load, seed: int = 0, end_s: float = math.inf) -> Flown:
     """The flight (5 frames a second) through an EstimatorNode. Vision registers each frame that it gets to its
     keyframe, as `FrameTracker` does, whatever then becomes of the message."""
-    node, flown = EstimatorNode(), Flown()
-    for message in [ORIGIN, *_messages(flight, load, np.random.default_rng([seed, 54]), end_s)]:
-        for reply in node.on(message):
-            if isinstance(reply, NavEstimate):
-                at_m = np.array(PLACE.to_local(reply.lat_deg, reply.lon_deg))
-                flown.estimates.append((reply, at_m - flight.poses[reply.frame_id][1][:2]))
-            elif isinstance(reply, MeasurementVerdict):
-                flown.verdicts.append(reply)
+    run, flown = EstimatorRun(), Flown()
+    for reply in run.feed([ORIGIN, *_messages(flight, load, np.random.default_rng([seed, 54]), end_s)]):
+        if isinstance(reply, NavEstimate):
+            at_m = np.array(PLACE.to_local(reply.lat_deg, reply.lon_deg))
+            flown.estimates.append((reply, at_m - flight.poses[reply.frame_id][1][:2]))
+        elif isinstance(reply, MeasurementVerdict):
+            flown.verdicts.append(reply)
     return flown
 
 
@@ -104,7 +103,7 @@ def _messages(flight: InertialFlight, load: Load, rng: np.random.Generator, end_
         else:
             age += 1
             due = i == 0 or age >= MAX_KEYFRAME_AGE or _shift(flight, keyframe, i) > KEYFRAME_SHIFT
-            odometry = flight.registered(i, keyframe, t_ns, rng, becomes_keyframe=due) if i else _first(flight)
+            odometry = flight.registered(i, keyframe, t_ns, rng, becomes_keyframe=due) if i else first_odometry(t_ns)
             keyframe, age = (i, 0) if due else (keyframe, age)
         if not load.lost(i):
             yield odometry
@@ -113,10 +112,6 @@ def _messages(flight: InertialFlight, load: Load, rng: np.random.Generator, end_
                 matches.append((i + round(load.match_late_s / FRAME_S), flight.fix(i, t_ns, rng)))
         yield from (match for due_at, match in matches if due_at <= i)
         matches = [(due_at, match) for due_at, match in matches if due_at > i]
-
-
-def _first(flight: InertialFlight) -> Odometry:
-    return next(m for m in flight.messages_by_frame[0] if isinstance(m, Odometry))
 
 
 def _shift(flight: InertialFlight, a: int, b: int) -> float:

@@ -8,12 +8,12 @@ import numpy as np
 
 from flight_records import write_record
 from map_matches import pose_of, with_pose
-from simulated_flight import PAIRS, PLACE, SIGMA_NORM, Flight, blind, t_ns
+from simulated_flight import PLACE, Flight, blind, t_ns
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.messages import Frame, MapMatch, Message, Odometry, Relocalization, Verdict
 from terrafix_tools.finalise.batch_smoother import Smoothed
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
-from textured_ground import apply, homography
+from terrafix_tools.sim.true_messages import seen_from
 
 Alter = Callable[[Message], Message | None]  # -> the message to use; None: it is left out
 
@@ -96,26 +96,15 @@ def errors(flight: Flight, graph: FlightGraph, smoothed: Smoothed) -> tuple[np.n
     return np.array(errors_m), np.array(covs)
 
 
-def nees(errors_m: np.ndarray, covs: np.ndarray) -> np.ndarray:
-    """-> (N,) squared Mahalanobis distances of the errors (N, 2)."""
-    return np.einsum("ni,ni->n", errors_m, np.linalg.solve(covs, errors_m[..., None])[..., 0])
-
-
 def seen_again(flight: Flight, keyframe: int, i: int, *, shown: int | None = None, fragment_id: int = 0) -> Message:
     """Frame i sees the ground of ``keyframe``; or, by mistake, that of the frame ``shown``."""
-    rng = np.random.default_rng([keyframe, i])
     truth = keyframe if shown is None else shown
-    xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
-    matrix = homography((flight.r_w_c[truth], flight.p_m[truth]), (flight.r_w_c[i], flight.p_m[i]))
-    seen = apply(matrix, xy) + rng.normal(0.0, SIGMA_NORM, xy.shape)
+    poses = [(flight.r_w_c[k], flight.p_m[k]) for k in (truth, i)]
     return Relocalization(
         t_ns=t_ns(i),
         frame_id=i,
         fragment_id=fragment_id,
         keyframe_id=keyframe,
         keyframe_fragment_id=0,
-        two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([xy, seen])],
-        sigma_norm=SIGMA_NORM,
-        inliers=PAIRS,
-        tracked=PAIRS,
+        **seen_from(poses[0], poses[1], np.random.default_rng([keyframe, i])),
     )

@@ -11,15 +11,12 @@ import numpy as np
 
 from map_matches import plane
 from terrafix.core.camera import Mount
-from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
+from terrafix.core.geodesy import LocalFrame, rot_w_b
 from terrafix.core.pose import exp_so3
-from terrafix.estimator.measurements.map_pose import ROOFS
 from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import (
     Camera,
     MapMatch,
-    MapPose,
-    MatchPlace,
     MeasurementVerdict,
     Message,
     NavEstimate,
@@ -29,11 +26,10 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
-from textured_ground import apply, homography
+from terrafix_tools.sim.true_messages import Pose, features, first_odometry, map_match, seen_from
 
 FRAME_S = 0.5
 SPEED_MPS = 12.0
-PAIRS, SIGMA_NORM = 40, 1.0 / 560.0
 KEYFRAME_EVERY = 3
 PLACE = LocalFrame(48.0, 11.0)
 CAMERA = Camera(  # calibrated: focal length to 1 %
@@ -50,8 +46,6 @@ ORIGIN = Origin(
     agl_sigma_m=2.0,
     attitude_sigma_deg=1.0,
 )
-# Sigmas of a map fix: east, north, up [m], rotation about east, north, up [rad].
-FIX_SIGMAS = np.array([2.0, 2.0, 3.0, math.radians(1.0), math.radians(1.0), math.radians(0.8)])
 
 
 @dataclass(frozen=True)
@@ -123,68 +117,38 @@ class Flight:
 
     def fix(self, i: int, offset_m: tuple[float, float] = (0.0, 0.0)) -> MapMatch:
         """Map match of frame i, with errors of its covariance and an additional ``offset_m`` (east, north)."""
-        height_m = self.p_m[i, 2] - self.ground_m[i]  # the image shows the height above ground; the map is flat
-        warp = np.array([0.0, 0.0, ROOFS * height_m, 0.0, 0.0, 0.0])
-        error = self.rng_of.normal(0.0, np.hypot(FIX_SIGMAS, warp))
-        p = np.array([*self.p_m[i, :2], height_m]) + error[:3] + (*offset_m, 0.0)
-        return MapMatch(
-            t_ns=t_ns(i),
-            frame_id=i,
-            verdict=Verdict.ACCEPTED,
-            matcher="gradient",
-            pose=MapPose(
-                p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-                q_w_c=quat_from_rot(exp_so3(error[3:]) @ self.r_w_c[i]),
-                cov=tuple(float(v) for v in np.diag(FIX_SIGMAS**2).ravel()),
-            ),
-            inliers=30,
-            place=MatchPlace(e_m=float(p[0]), n_m=float(p[1]), mass=0.99),
-            ground=plane(0.0) if self.dem else None,
-        )
+        ground = plane(0.0) if self.dem else None
+        return map_match(t_ns(i), i, self.pose_over(i, i), self.rng_of, offset_m=offset_m, ground=ground)
+
+    def pose_over(self, i: int, below: int) -> Pose:
+        """Of frame i, above the ground below frame ``below``: the image shows the height above it; the map is flat."""
+        return self.r_w_c[i], self.p_m[i] - np.array([0.0, 0.0, self.ground_m[below]])
 
     def _state(self, i: int, yaw_rad: float, angles: np.ndarray, agl_m: float) -> VehicleState:
         noise = self.rng_of.normal(0.0, 1.0, 4)
         tilt = np.radians(ORIGIN.attitude_sigma_deg) * noise[:2]
-        state = VehicleState(
+        yaw_rad = math.remainder(yaw_rad + math.radians(1.0) * float(noise[2]), 2 * math.pi)
+        return VehicleState(
             t_ns=t_ns(i),
             source="simulated",
-            yaw_rad=math.remainder(yaw_rad + math.radians(1.0) * float(noise[2]), 2 * math.pi),
-            pitch_rad=float(angles[0] + tilt[0]),
-            roll_rad=float(angles[1] + tilt[1]),
-            agl_m=agl_m + float(noise[3]),
-        )
-        return VehicleState(
-            t_ns=state.t_ns,
-            source=state.source,
-            yaw_rad=state.yaw_rad if "yaw" in self.telemetry else None,
-            pitch_rad=state.pitch_rad if "attitude" in self.telemetry else None,
-            roll_rad=state.roll_rad if "attitude" in self.telemetry else None,
-            agl_m=state.agl_m if "height" in self.telemetry else None,
+            yaw_rad=yaw_rad if "yaw" in self.telemetry else None,
+            pitch_rad=float(angles[0] + tilt[0]) if "attitude" in self.telemetry else None,
+            roll_rad=float(angles[1] + tilt[1]) if "attitude" in self.telemetry else None,
+            agl_m=agl_m + float(noise[3]) if "height" in self.telemetry else None,
         )
 
     def _odometry(self, i: int) -> Odometry:
-        keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
-        is_keyframe = i % KEYFRAME_EVERY == 0
         if i == 0:
-            return Odometry(
-                t_ns=0, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True, fragment_id=0
-            )
-        rng = self.rng_of
-        keyframe_xy = np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
-        below = np.array([0.0, 0.0, self.ground_m[keyframe]])
-        matrix = homography((self.r_w_c[keyframe], self.p_m[keyframe] - below), (self.r_w_c[i], self.p_m[i] - below))
-        frame_xy = apply(matrix, keyframe_xy) + rng.normal(0.0, SIGMA_NORM, keyframe_xy.shape)
+            return first_odometry(0)
+        keyframe = keyframe_of(i)
         return Odometry(
             t_ns=t_ns(i),
             frame_id=i,
             keyframe_id=keyframe,
             verdict=Verdict.ACCEPTED,
-            two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in np.hstack([keyframe_xy, frame_xy])],
-            sigma_norm=SIGMA_NORM,
-            inliers=PAIRS,
-            tracked=PAIRS,
-            becomes_keyframe=is_keyframe,
+            becomes_keyframe=i % KEYFRAME_EVERY == 0,
             fragment_id=0,
+            **seen_from(self.pose_over(keyframe, keyframe), self.pose_over(i, keyframe), self.rng_of),
         )
 
 
@@ -209,6 +173,11 @@ class EstimatorRun:
             self.feed(flight.messages(i))
         return self
 
+    def estimates(self) -> list[NavEstimate]:
+        """-> the last published estimate of each frame, in their order."""
+        last = {m.frame_id: m for m in self.published if isinstance(m, NavEstimate)}
+        return [last[i] for i in sorted(last)]
+
     def estimate(self, frame_id: int) -> NavEstimate:
         """-> the last published estimate of a frame."""
         return [m for m in self.published if isinstance(m, NavEstimate) and m.frame_id == frame_id][-1]
@@ -222,26 +191,19 @@ class EstimatorRun:
 def same_features(flight: Flight, keyframe: int, i: int, features: np.ndarray) -> Odometry:
     """Odometry of frame i against ``keyframe`` with the same ``features`` (N, 2; normalised coordinates in the
     keyframe) for every frame."""
-    below = np.array([0.0, 0.0, flight.ground_m[keyframe]])
-    views = [(flight.r_w_c[k], flight.p_m[k] - below) for k in (keyframe, i)]
-    noise = np.random.default_rng([i, 3]).normal(0.0, SIGMA_NORM, features.shape)
-    pairs = np.hstack([features, apply(homography(views[0], views[1]), features) + noise]).tolist()
-    return Odometry(
-        t_ns=t_ns(i),
-        frame_id=i,
-        keyframe_id=keyframe,
-        verdict=Verdict.ACCEPTED,
-        two_view=[(a, b, c, d) for a, b, c, d in pairs],
-        sigma_norm=SIGMA_NORM,
-        inliers=len(pairs),
-        tracked=len(pairs),
-    )
+    poses = flight.pose_over(keyframe, keyframe), flight.pose_over(i, keyframe)
+    seen = seen_from(*poses, np.random.default_rng([i, 3]), features)
+    return Odometry(t_ns=t_ns(i), frame_id=i, keyframe_id=keyframe, verdict=Verdict.ACCEPTED, **seen)
 
 
 def some_features() -> np.ndarray:
-    """(PAIRS, 2) features of one image, normalised coordinates."""
-    rng = np.random.default_rng(3)
-    return np.column_stack([rng.uniform(-0.7, 0.7, PAIRS), rng.uniform(-0.3, 0.3, PAIRS)])
+    """(PAIRS, 2) the same each time."""
+    return features(np.random.default_rng(3))
+
+
+def keyframe_of(i: int) -> int:
+    """Of frame i."""
+    return max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
 
 
 def t_ns(i: int) -> int:

@@ -55,20 +55,6 @@ def view(
     return cv2.remap(ground, column, row, cv2.INTER_CUBIC if finer else cv2.INTER_AREA)
 
 
-def homography(from_pose: tuple[np.ndarray, np.ndarray], to_pose: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """-> (3, 3) plane-induced homography: normalised coordinates of ground points in the first camera -> in the second.
-    Poses are (R_w_c, position in w)."""
-    (r_a, p_a), (r_b, p_b) = from_pose, to_pose
-    normal = r_a.T @ np.array([0.0, 0.0, -1.0])  # of the ground plane, in camera a, pointing away from the camera
-    return r_b.T @ (np.eye(3) + np.outer(p_a - p_b, normal @ r_a.T) / p_a[2]) @ r_a
-
-
-def apply(matrix: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Applies a homography (3, 3) to points (N, 2)."""
-    q = np.column_stack([xy, np.ones(len(xy))]) @ matrix.T
-    return q[:, :2] / q[:, 2:]
-
-
 class FlatMap:
     """The ground with the interface of ``LocalMap`` that the matcher uses: windows in local metres, invalid beyond the
     edges. ``shift_m``: error of the map, east and north."""

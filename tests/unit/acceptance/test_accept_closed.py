@@ -17,7 +17,7 @@ from terrafix_tools.accept import closed
 from terrafix_tools.accept.closed import EditedCamera, sent_fixes
 from terrafix_tools.accept.false_inputs import loop_integrity as of
 from terrafix_tools.accept.false_inputs import scenarios
-from terrafix_tools.accept.false_inputs.closed_loop import LIES_IN_THE_LOOP
+from terrafix_tools.accept.false_inputs.scenarios import LIES_IN_THE_LOOP
 from terrafix_tools.accept.measuring.criteria import judge
 from terrafix_tools.accept.measuring.evidence import Evidence, SentFix
 from terrafix_tools.accept.measuring.results import Marks, Span, Verdict

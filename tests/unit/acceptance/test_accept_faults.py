@@ -14,9 +14,10 @@ from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, Frame, Health, MapMatch, Message, Origin, Prediction, VehicleState, Verdict
 from terrafix.vision.sources import Shot
+from terrafix_tools.accept.false_inputs import inputs as lying
+from terrafix_tools.accept.false_inputs.maps import stale_along
 from terrafix_tools.accept.faults import flight_edits
 from terrafix_tools.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
-from terrafix_tools.accept.faults.stale_map import stale_along
 from terrafix_tools.accept.flight import Flight, FrameRef, read_any_truth
 from terrafix_tools.accept.measuring.results import Span
 from terrafix_tools.accept.plan import Plan
@@ -93,8 +94,8 @@ def test_a_foreign_frame_is_inserted_between_two_others() -> None:
 
 def test_black_and_frozen_pictures() -> None:
     span = Span(3.0, 5.0, "")
-    assert [grey(s) for s in altered(flight_edits.black(span))] == [1, 2, 3, 0, 0, 0, *range(7, 13)]
-    assert [grey(s) for s in altered(flight_edits.frozen(span))] == [1, 2, 3, 3, 3, 3, *range(7, 13)]
+    assert [grey(s) for s in altered(lying.black(span))] == [1, 2, 3, 0, 0, 0, *range(7, 13)]
+    assert [grey(s) for s in altered(lying.frozen(span))] == [1, 2, 3, 3, 3, 3, *range(7, 13)]
 
 
 def test_edits_of_telemetry() -> None:

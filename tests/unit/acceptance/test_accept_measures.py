@@ -14,7 +14,6 @@ from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_tools.accept.measuring import measures as of
-from terrafix_tools.accept.measuring.consistency import nees_band
 from terrafix_tools.accept.measuring.criteria import CRITERIA, judge
 from terrafix_tools.accept.measuring.results import Bounds, JudgedRow, Marks, Span, Verdict, with_unit
 
@@ -294,17 +293,6 @@ def test_bounds_and_their_texts() -> None:
     assert Bounds(low=0.8).text("%") == ">= 80 %" and Bounds(high=50.0).text("m") == "<= 50 m"
     assert Bounds(0.93, 0.98).text("%") == "93 to 98 %"
     assert with_unit(0.9549, "%") == "95.5 %" and with_unit(None, "m") == "-" and with_unit(0.0, "") == "0"
-
-
-def test_the_nees_band_agrees_with_simulated_draws() -> None:
-    """Means of n squared Mahalanobis distances in two dimensions, by simulation."""
-    for count in (1, 2, 12):
-        draws = (np.random.default_rng(3).normal(size=(40_000, count, 2)) ** 2).sum(axis=2).mean(axis=1)
-        assert nees_band(count) == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.05)
-
-
-def test_the_nees_band_of_one_draw_is_that_of_chi_square_with_two_degrees_of_freedom() -> None:
-    assert nees_band(1) == pytest.approx([-2.0 * np.log(0.975), -2.0 * np.log(0.025)])
 
 
 def coverage_row(tmp_path: Path, frames: list[FrameCase]) -> JudgedRow:

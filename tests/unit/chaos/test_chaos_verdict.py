@@ -15,6 +15,7 @@ from terrafix_tools.chaos.run import Results
 from terrafix_tools.chaos.scene import AGL_M, Phase, phases
 from terrafix_tools.chaos.table import table, write_table
 from terrafix_tools.chaos.verdict import Outcome
+from terrafix_tools.score import longest_gap_s
 from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.report import ReceivedFix
 from terrafix_tools.sim.camera.stream import FrameStream
@@ -27,9 +28,9 @@ def ticks(from_s: float, to_s: float) -> list[float]:
 
 def test_silence_is_the_longest_time_without_a_message_and_reaches_to_the_ends() -> None:
     received = [*ticks(0.0, 5.0), *ticks(9.0, 12.0)]
-    assert verdict.silence_s(received, 4.0, 12.0) == pytest.approx(4.1, abs=0.11)
-    assert verdict.silence_s(received, 4.0, 20.0) == pytest.approx(8.1, abs=0.11)
-    assert verdict.silence_s([], 4.0, 7.0) == 3.0
+    assert longest_gap_s(received, 4.0, 12.0) == pytest.approx(4.1, abs=0.11)
+    assert longest_gap_s(received, 4.0, 20.0) == pytest.approx(8.1, abs=0.11)
+    assert longest_gap_s([], 4.0, 7.0) == 3.0
 
 
 def test_the_fix_is_back_when_none_is_missing_any_more() -> None:

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from map_matches import with_search
-from recorded_flight import blind_between, errors, nees, replayed_graph, shifted, unmatched
+from recorded_flight import blind_between, errors, replayed_graph, shifted, unmatched
 from simulated_flight import ORIGIN, EstimatorRun, Flight, error_m
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.messages import MapMatch, Message, SearchResult, Verdict
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import FlightReplayer
+from terrafix_tools.score import nees_of
 
 FAR_M = (350.0, -200.0)
 
@@ -26,7 +27,7 @@ def test_the_smoothed_track_is_more_accurate_than_in_flight_and_consistent() -> 
         flight = Flight(54, seed=seed, dem=True)  # without a DEM the covariance includes hills
         graph = replayed_graph(flight)
         errors_m, covs = errors(flight, graph, smooth(graph))
-        squares.append(nees(errors_m, covs))
+        squares.append(nees_of(errors_m, covs))
         run = EstimatorRun().fly(flight, 0, flight.frames)
         immediate = np.array([error_m(run.estimate(i), flight)[:2] for i in range(flight.frames)])
         ratios.append(median_m(errors_m) / median_m(immediate))
@@ -60,7 +61,7 @@ def test_a_blackout_is_interpolated_from_both_sides() -> None:
     errors_m, covs = errors(flight, graph, smooth(graph))
     sigma = np.sqrt(covs[:, 0, 0] + covs[:, 1, 1])
     assert sigma[40] > 1.5 * max(sigma[25], sigma[60])
-    assert np.mean(nees(errors_m, covs) < 9.21) > 0.95
+    assert np.mean(nees_of(errors_m, covs) < 9.21) > 0.95
     assert np.hypot(*errors_m[60:].T).max() < 8.0
 
 
@@ -147,7 +148,7 @@ def test_without_map_matches_the_track_follows_from_start_and_odometry() -> None
     errors_m, covs = errors(flight, graph, smoothed)
     assert smoothed.placed.all() and not graph.fixes
     assert covs[-1].trace() > covs[0].trace() > 2.0 * 14.0**2
-    assert nees(errors_m, covs).max() < 13.8
+    assert nees_of(errors_m, covs).max() < 13.8
 
 
 @pytest.mark.slow
@@ -162,7 +163,7 @@ def test_consistent_outliers_at_the_end_widen_the_covariance_over_both_positions
     graph = replayed_graph(flight, alter)
     smoothed = smooth(graph)
     errors_m, covs = errors(flight, graph, smoothed)
-    assert np.all(nees(errors_m, covs)[75:] < 9.21) and covs[80, 0, 0] > 30.0**2
+    assert np.all(nees_of(errors_m, covs)[75:] < 9.21) and covs[80, 0, 0] > 30.0**2
 
 
 def test_a_record_with_two_origins_gives_two_flights() -> None:

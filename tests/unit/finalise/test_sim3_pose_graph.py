@@ -9,13 +9,9 @@ from terrafix.core.pose import exp_so3
 from terrafix.smoother.sim3_pose_graph import merge
 from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, RelativeConstraint, Submap
 from terrafix_tools.bench.growth.merging import STEP_SIGMAS, SubmapFlight, make_submap_flight, measure, pose_errors
+from terrafix_tools.score import nees_of
 
 CHI2_95_2 = 5.991
-
-
-def nees(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
-    """NEES (M,) of errors (M, k) in covariances (M, k, k)."""
-    return np.einsum("ni,ni->n", errors, np.linalg.solve(covs, errors[..., None])[..., 0])
 
 
 def without(flight: SubmapFlight, *gone: int) -> list[AbsoluteConstraint]:
@@ -58,11 +54,11 @@ def test_the_covariance_is_consistent_with_the_errors(scale_known: bool) -> None
     for seed in range(16):
         flight = make_submap_flight(seed, submaps=2, keyframes=40, scale_known=scale_known)
         errors, covs = pose_errors(flight, merge(flight.submaps, flight.anchors))
-        nees_6d.append(nees(errors, covs))
+        nees_6d.append(nees_of(errors, covs))
         r = np.concatenate(flight.r_w_c)
         to_ground = r[:, :2, :]
         east_north = np.einsum("nij,nj->ni", to_ground, errors[:, 3:])
-        nees_horizontal.append(nees(east_north, to_ground @ covs[:, 3:, 3:] @ np.transpose(to_ground, (0, 2, 1))))
+        nees_horizontal.append(nees_of(east_north, to_ground @ covs[:, 3:, 3:] @ np.transpose(to_ground, (0, 2, 1))))
     assert 0.85 < float(np.mean(nees_6d)) / 6.0 < 1.2
     assert 0.92 < float(np.mean(np.concatenate(nees_horizontal) <= CHI2_95_2)) < 0.98
 
@@ -107,7 +103,7 @@ def test_a_relocalisation_places_a_submap_without_anchors() -> None:
         assert merged.joins.tolist() == [True] and merged.placements[1] is not None
         errors, covs = pose_errors(flight, merged)
         assert np.linalg.norm(errors[:, 3:], axis=1).max() < 25.0
-        assert float(np.mean(nees(errors, covs))) / 6.0 < 3.0
+        assert float(np.mean(nees_of(errors, covs))) / 6.0 < 3.0
         assert covs[45, 3:, 3:].trace() > covs[15, 3:, 3:].trace()  # it has no absolute constraints
 
 

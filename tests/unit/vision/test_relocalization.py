@@ -6,7 +6,8 @@ import pytest
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import OVERTAKEN, Frame, Message, Odometry, Relocalization, Verdict
 from terrafix.vision.node import VisionNode
-from textured_ground import PINHOLE, apply, homography, rotation, texture, view
+from terrafix_tools.sim.true_messages import apply, homography
+from textured_ground import PINHOLE, rotation, texture, view
 from vision_origin import PINHOLE_ORIGIN as ORIGIN
 
 AGL_M = 100.0

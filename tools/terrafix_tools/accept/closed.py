@@ -16,7 +16,7 @@ from terrafix.link.integrity.fix_type import FIX_3D
 from terrafix.messages import Frame, GpsInput
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept.false_inputs.closed_loop import LIES_IN_THE_LOOP
+from terrafix_tools.accept.false_inputs.scenarios import LIES_IN_THE_LOOP
 from terrafix_tools.accept.faults.flight_edits import Edit
 from terrafix_tools.accept.generated import KINDS
 from terrafix_tools.accept.measuring.evidence import Evidence, SentFix, gather

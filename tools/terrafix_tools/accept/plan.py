@@ -29,6 +29,13 @@ class Plan:
     marks: Marks = field(default_factory=Marks)
 
 
+def always(
+    edit: flight_edits.Edit = flight_edits.unchanged, origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin
+) -> Callable[[Flight], Plan]:
+    """The same plan for every flight."""
+    return lambda _: Plan(edit, origin)
+
+
 @dataclass(frozen=True)
 class Scenario:
     name: str

@@ -15,8 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from terrafix.core.errors import ERROR_OF_EXIT_CODE, MapError, OutputError, UsageError
 from terrafix.vision.sources import open_source
 from terrafix_tools.accept import fly
-from terrafix_tools.accept.false_inputs.closed_loop import LIES_IN_THE_LOOP
-from terrafix_tools.accept.false_inputs.scenarios import LIES
+from terrafix_tools.accept.false_inputs.scenarios import LIES, LIES_IN_THE_LOOP
 from terrafix_tools.accept.fly import RESULT, Job, Result
 from terrafix_tools.accept.measuring.criteria import failed, unmeasured
 from terrafix_tools.accept.measuring.results import BROKEN, with_unit

@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.node import Image, Node, NodeContext
+from terrafix_tools.accept.false_inputs import inputs
+from terrafix_tools.accept.false_inputs.maps import REACH, stale_along
 from terrafix_tools.accept.false_inputs.scenarios import LIES
 from terrafix_tools.accept.faults import flight_edits
 from terrafix_tools.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
-from terrafix_tools.accept.faults.stale_map import REACH, stale_along
 from terrafix_tools.accept.flight import Flight
 from terrafix_tools.accept.measuring.criteria import EVERYWHERE
 from terrafix_tools.accept.measuring.results import Marks, Span
-from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
+from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario, always
 from terrafix_tools.replay import make_nodes
 
 FOREIGN_AT = (0.3, 0.55, 0.8)  # of the frames
@@ -30,14 +31,10 @@ KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the opposite: 990 m, w
 WITH_SPAN = ("claims", "coverage", "false fixes", "both estimates", "within 50 m outside", "says so", "found again")
 
 
-def _as_it_is(_: Flight) -> Plan:
-    return Plan()
-
-
 def _foreign_frame(flight: Flight) -> Plan | str:
     if len(flight.frame_refs) < 8:
         return f"the flight has only {len(flight.frame_refs)} frames"
-    mirrored = np.ascontiguousarray(flight.picture(0)[:, ::-1])
+    mirrored = inputs.mirrored(flight.picture(0))
     return _foreign({flight.frame_refs[flight.at(share)].file: mirrored for share in FOREIGN_AT})
 
 
@@ -153,7 +150,7 @@ def _blackout(flight: Flight) -> Plan | str:
         return f"the flight lasts {flight.duration_s:.0f} s, and {needed_s:.0f} s are needed"
     from_s = flight.frame_refs[0].t_s + (flight.duration_s - BLACKOUT_S) * BEFORE_S / (BEFORE_S + AFTER_S)
     span = Span(from_s, from_s + BLACKOUT_S, "black pictures")
-    return Plan(flight_edits.black(span), marks=Marks(spans=(span,)))
+    return Plan(inputs.black(span), marks=Marks(spans=(span,)))
 
 
 def _stall(flight: Flight) -> Plan | str:
@@ -161,25 +158,13 @@ def _stall(flight: Flight) -> Plan | str:
         return f"the flight lasts only {flight.duration_s:.0f} s"
     from_s = flight.frame_refs[flight.at(0.5)].t_s
     span = Span(from_s, from_s + STALL_S, "the same picture again and again")
-    return Plan(flight_edits.frozen(span), marks=Marks(spans=(span,)))
+    return Plan(inputs.frozen(span), marks=Marks(spans=(span,)))
 
 
 def _over_water(flight: Flight) -> Plan:
     from terrafix_tools.accept.generated import WATER  # only for generated ground
 
     return Plan(marks=Marks(spans=(_share_of(flight, WATER, "over open water"),)))
-
-
-def _height_wrong(_: Flight) -> Plan:
-    return Plan(flight_edits.height_times(1.10))
-
-
-def _compass_wrong(_: Flight) -> Plan:
-    return Plan(flight_edits.yaw_plus(15.0))
-
-
-def _heading_unknown(_: Flight) -> Plan:
-    return Plan(flight_edits.yaw_unknown())
 
 
 def _kidnapped(flight: Flight) -> Plan:
@@ -207,7 +192,7 @@ BASELINE = (
     "asks",
 )  # fmt: skip
 SCENARIOS: tuple[Scenario, ...] = (
-    Scenario("baseline", "A flight without faults.", BASELINE, _as_it_is),
+    Scenario("baseline", "A flight without faults.", BASELINE, always()),
     Scenario(
         "foreign frame", "Three pictures of another place among the frames: rejected, without effect on the next ones.",
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _foreign_frame),
@@ -233,20 +218,24 @@ SCENARIOS: tuple[Scenario, ...] = (
         (*WITH_SPAN, "asks"), _blackout, frames=270),
     Scenario(
         "GNSS jam", "Jammed after 40 s, with Terrafix as second GPS: the aircraft flies on. Closed loop.",
-        IN_THE_LOOP, _as_it_is, ground=CLOSED_LOOP),
+        IN_THE_LOOP, always(), ground=CLOSED_LOOP),
     Scenario(
         "slow spoof", "GNSS is correct for 40 s, then drifts at 2 m/s: the aircraft does not follow it. Closed loop.",
-        IN_THE_LOOP, _as_it_is, ground=CLOSED_LOOP, frames=300),
+        IN_THE_LOOP, always(), ground=CLOSED_LOOP, frames=300),
     Scenario(
-        "season change", "Camera and map in the two seasons that differ most.", EVERYWHERE, _as_it_is, ground="season"),
-    Scenario("low texture", "Ground of an eighth of the contrast.", EVERYWHERE, _as_it_is, ground="low texture"),
+        "season change", "Camera and map in the two seasons that differ most.", EVERYWHERE, always(), ground="season"),
+    Scenario("low texture", "Ground of an eighth of the contrast.", EVERYWHERE, always(), ground="low texture"),
     Scenario(
         "water", "A third of the route over open water: no map fix there, and no false one.",
         WITH_SPAN, _over_water, ground="water"),
-    Scenario("hill country", "Relief of some 300 m, a kilometre wide.", EVERYWHERE, _as_it_is, ground="hills"),
-    Scenario("height wrong by 10 %", "The reported height is 10 % too large.", EVERYWHERE, _height_wrong),
-    Scenario("compass wrong by 15 degrees", "The reported heading is off by 15 degrees.", EVERYWHERE, _compass_wrong),
-    Scenario("heading unknown", "No heading is reported.", EVERYWHERE, _heading_unknown),
+    Scenario("hill country", "Relief of some 300 m, a kilometre wide.", EVERYWHERE, always(), ground="hills"),
+    Scenario(
+        "height wrong by 10 %", "The reported height is 10 % too large.",
+        EVERYWHERE, always(flight_edits.height_times(1.10))),
+    Scenario(
+        "compass wrong by 15 degrees", "The reported heading is off by 15 degrees.",
+        EVERYWHERE, always(flight_edits.yaw_plus(15.0))),
+    Scenario("heading unknown", "No heading is reported.", EVERYWHERE, always(flight_edits.yaw_unknown())),
     Scenario(
         "kidnapped", "The start coordinate has an error of a kilometre and a stated sigma of tens of metres.",
         ("claims", "coverage", "false fixes", "found again", "asks"), _kidnapped),

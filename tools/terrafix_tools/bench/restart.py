@@ -25,7 +25,8 @@ from terrafix_tools.bench.result_file import write_result
 from terrafix_tools.chaos.rig import Rig
 from terrafix_tools.chaos.scene import Scene
 from terrafix_tools.chaos.shuttle import RUN, shuttle_in
-from terrafix_tools.chaos.verdict import back_s, sigmas, silence_s, without_fix_s, wrong_fixes
+from terrafix_tools.chaos.verdict import back_s, sigmas, without_fix_s, wrong_fixes
+from terrafix_tools.score import longest_gap_s
 from terrafix_tools.standalone import run_standalone
 
 STEADY_S = 1.0  # with a fix before each kill
@@ -81,7 +82,7 @@ def _kill(rig: Rig, name: str) -> Kill:
     fixes_s = [fix.received_s for fix in rig.peer.fixes()]
     return Kill(
         name,
-        silence_s(rig.peer.received_s, killed_s, now_s),
+        longest_gap_s(rig.peer.received_s, killed_s, now_s),
         without_fix_s(fixes_s, killed_s, now_s),
         back_s(fixes_s, killed_s, now_s),
     )

@@ -20,6 +20,7 @@ from terrafix_tools.chaos.faults import DISK_MB, Fault
 from terrafix_tools.chaos.rig import NONE, ROOT, Need, Rig
 from terrafix_tools.chaos.scene import LEAD_S, Phase, Scene
 from terrafix_tools.chaos.verdict import Outcome
+from terrafix_tools.score import longest_gap_s
 
 DARK_LEAD_S = 4.0  # black images before the fault
 STEP_S = 0.01
@@ -97,7 +98,7 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
         wrong=len(judge.wrong_fixes(fixes, rig.scene.truth_sigma_m)),
         worst_sigmas=max((judge.sigmas(fix, rig.scene.truth_sigma_m) for fix in fixes), default=None),
         worst_error_m=max((fix.error_m for fix in fixes), default=None),
-        silence_s=judge.silence_s(rig.peer.received_s, fault_s, end_s),
+        silence_s=longest_gap_s(rig.peer.received_s, fault_s, end_s),
         without_fix_s=judge.without_fix_s(times, fault_s, end_s),
         back_s=judge.back_s(times, ended_s, end_s),
         load=os.getloadavg()[0] / (os.cpu_count() or 1),

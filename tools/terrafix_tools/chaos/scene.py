@@ -1,7 +1,8 @@
 """The flight of the fault matrix: a copter over a generated place, from take-off to landing, with its phases."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import Camera
 from terrafix_tools.mission.file import write_mission
 from terrafix_tools.mission.items import Do, Item, Mission
-from terrafix_tools.sim.autopilot.course import Course, PeerState, read_course, write_course
+from terrafix_tools.sim.autopilot.course import Course, PeerState, peer_state_of, read_course, write_course
 from terrafix_tools.sim.autopilot.parameters import Kind
 from terrafix_tools.sim.flights.folder import CAMERA, FRAME_HZ, Flight
 from terrafix_tools.sim.flights.make import MAP_NAME, FlightOptions, make
@@ -96,12 +97,8 @@ def mission_along(name: str, seed: int, way_m: Sequence[tuple[float, float]]) ->
 def _states(flight: Flight) -> list[tuple[float, PeerState]]:
     rows = []
     for t_s in np.arange(0.0, flight.path.duration_s, STEP_S).tolist():
-        state = flight.path.state(t_s)
-        e_m, n_m, up_m = (float(v) for v in state.p_b_in_w_m)
-        ve, vn, vu = (float(v) for v in state.velocity_enu_mps)
-        lat_deg, lon_deg = flight.frame.to_wgs84(e_m, n_m)
-        angles = state.yaw_rad, state.pitch_rad, state.roll_rad
-        rows.append((t_s, PeerState(lat_deg, lon_deg, up_m, state.agl_m, *angles, vn, ve, -vu)))
+        state = peer_state_of(flight.path.state(t_s), flight.frame)
+        rows.append((t_s, replace(state, airspeed_mps=math.nan)))  # it has no sensor of airspeed
     return rows
 
 

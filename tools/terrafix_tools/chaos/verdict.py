@@ -36,13 +36,6 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     load: float | None = None  # load average of the computer over its cores at the end
 
 
-def silence_s(received_s: Sequence[float], from_s: float, to_s: float) -> float:
-    """Longest time without a message between two times."""
-    inside = [t for t in received_s if from_s <= t <= to_s]
-    times = [from_s, *inside, to_s]
-    return max(b - a for a, b in itertools.pairwise(times))
-
-
 def without_fix_s(fixes_s: Sequence[float], from_s: float, to_s: float) -> float:
     times = [from_s, *(t for t in fixes_s if from_s <= t <= to_s), to_s]
     gaps = (b - a for a, b in itertools.pairwise(times))

@@ -4,7 +4,6 @@ import hashlib
 import math
 from collections import Counter
 from datetime import UTC, date, datetime
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from terrafix_tools.evaluate import read_summary
 from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.report.data import FlightView, ellipse95
 from terrafix_tools.report.gather import read_record
+from terrafix_tools.score import longest_gap_s
 
 NS = 1_000_000_000
 ID_DIGITS = 16  # hexadecimal; two of a million flights have the same ID with a probability of 3e-8
@@ -100,7 +100,7 @@ def longest_without_fix_s(times_s: list[float], fixes_s: list[float]) -> float |
     """Longest time between two fixes, or between one and the first or last frame; None without a frame."""
     if not times_s:
         return None
-    return max(b - a for a, b in pairwise([times_s[0], *fixes_s, times_s[-1]]))
+    return longest_gap_s(fixes_s, times_s[0], times_s[-1])
 
 
 def _start(view: FlightView, origin: Origin) -> datetime | None:

@@ -7,9 +7,10 @@ import numpy as np
 
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pnp import solved
-from terrafix.messages import MapMatch, MapPose, MatchPlace, Verdict
+from terrafix.messages import MapMatch, Verdict
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flown import Shot
+from terrafix_tools.sim.true_messages import placed
 
 WRONG_SHARE, WRONG_M = 0.10, (30.0, 400.0)  # share of the matches, offset from the true position
 JUMP_M, JUMPS = 350.0, 6
@@ -79,16 +80,6 @@ def no_match(match: MapMatch) -> MapMatch:
 def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.random.Generator) -> MapMatch:
     """An accepted match with a small covariance, ``offset_m`` (2,) from the true position."""
     p = shot.p_m + np.array([*(offset_m + WRONG_SIGMA_M * rng.normal(size=2)), WRONG_SIGMA_M * rng.normal()])
-    cov = np.diag([WRONG_SIGMA_M**2] * 3 + [WRONG_SIGMA_RAD**2] * 3)
-    return msgspec.structs.replace(
-        solved(msgspec.structs.replace(match, verdict=Verdict.ACCEPTED)),
-        verdict=Verdict.ACCEPTED,
-        inliers=30,
-        pose=MapPose(
-            p_c_in_w_m=(float(p[0]), float(p[1]), float(p[2])),
-            q_w_c=quat_from_rot(shot.r_w_c),
-            cov=tuple(float(v) for v in cov.ravel()),
-        ),
-        place=MatchPlace(e_m=float(p[0]), n_m=float(p[1]), mass=0.99),
-        belief=None,
-    )
+    sigmas = np.array([WRONG_SIGMA_M] * 3 + [WRONG_SIGMA_RAD] * 3)
+    found = solved(msgspec.structs.replace(match, verdict=Verdict.ACCEPTED, belief=None))
+    return placed(found, p, quat_from_rot(shot.r_w_c), sigmas, inliers=30)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.anchor.localizer import NEW_GROUND_SHARE
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.pose import log_so3
@@ -30,7 +29,7 @@ from terrafix.smoother.node import SmootherNode
 from terrafix_tools.montecarlo.faults import Faults
 from terrafix_tools.montecarlo.flown import Shot, fly
 from terrafix_tools.montecarlo.ground import MapError, Terrain
-from terrafix_tools.montecarlo.lens import Lens, footprint_m
+from terrafix_tools.montecarlo.lens import Lens
 from terrafix_tools.montecarlo.lies import FindMatch, Lies
 from terrafix_tools.montecarlo.matches import MapMatches
 from terrafix_tools.montecarlo.plan import FlightPlan
@@ -44,7 +43,6 @@ class Record:
     plan: FlightPlan
     t_s: np.ndarray
     path_m: np.ndarray  # (N,) flown over ground
-    new_ground: np.ndarray  # (N,) 0..1, share that the frame before did not show, as the anchor counts it
     truth_m: np.ndarray  # (N, 2)
     error_m: np.ndarray  # (N, 6): east, north, up [m], rotation about them [rad]; estimate minus truth
     cov: np.ndarray  # (N, 6, 6) as published
@@ -83,7 +81,6 @@ class Run:
             plan=plan,
             t_s=np.array([shot.t_s for shot in flown.frames]),
             path_m=flown.path_m,
-            new_ground=_new_ground(plan, flown.path_m),
             truth_m=np.array([shot.p_m[:2] for shot in flown.frames]),
             error_m=np.full((n, 6), np.nan),
             cov=np.full((n, 6, 6), np.nan),
@@ -212,9 +209,3 @@ def find_match(matches: MapMatches, faults: Faults, t_s: float) -> FindMatch:
     if faults.is_unmapped(t_s):
         return partial(matches.no_match, verdict=Verdict.FEW_INLIERS)
     return matches.match
-
-
-def _new_ground(plan: FlightPlan, path_m: np.ndarray) -> np.ndarray:
-    """(N,) 0..1 of each frame, from the way since the frame before; 1 for the first one."""
-    side_m = footprint_m(plan.camera, plan.agl_m)
-    return np.append(1.0, np.minimum(np.diff(path_m) / (NEW_GROUND_SHARE * side_m), 1.0))

@@ -113,7 +113,7 @@ def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
             if plan.has_imu:
                 batch.append(readings)
         if len(batch) == IMU_BATCH:
-            waiting.append(_imu(batch))
+            waiting.append(imu_of(batch, "montecarlo"))
             batch = []
         if i % frame_every == 0:
             frames.append(shot(state))
@@ -164,10 +164,11 @@ def _vehicle_state(plan: FlightPlan, readings: Readings, home_m: float) -> Vehic
     )
 
 
-def _imu(batch: list[Readings]) -> Imu:
+def imu_of(batch: list[Readings], source: str) -> Imu:
+    """The inertial readings of a batch as one message, at the time of the last."""
     newest_ns = round(batch[-1].t_s * 1e9)
     samples = [(newest_ns - round(r.t_s * 1e9), *r.accel_b_mps2.tolist(), *r.gyro_b_radps.tolist()) for r in batch]
-    return Imu(t_ns=newest_ns, source="montecarlo", samples=samples)
+    return Imu(t_ns=newest_ns, source=source, samples=samples)
 
 
 def _origin(plan: FlightPlan, home_m: float) -> Origin:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -145,15 +146,13 @@ def _camera(width: int, height: int, focal_px: float, mount_tolerance_deg: float
 
 def _with_fault(drawn: FlightPlan, sign: float, rng: np.random.Generator) -> FlightPlan:
     """With the parameters that the fault of the flight changes. ``sign``: of an error of height or heading."""
-    if drawn.fault is Fault.HILLS:
-        return replace(drawn, hills_m=20.0, has_dem=False)
-    if drawn.fault is Fault.PHOTOS:
-        return replace(drawn, frame_hz=PHOTOS_HZ, has_imu=False)
-    if drawn.fault is Fault.HEIGHT:
-        return replace(drawn, height_scale=1.0 + sign * 0.1)
-    if drawn.fault is Fault.COMPASS:
-        return replace(drawn, compass_rad=sign * math.radians(float(rng.uniform(10.0, 15.0))))
-    return drawn
+    changes: dict[Fault, dict[str, Any]] = {
+        Fault.HILLS: {"hills_m": 20.0, "has_dem": False},
+        Fault.PHOTOS: {"frame_hz": PHOTOS_HZ, "has_imu": False},
+        Fault.HEIGHT: {"height_scale": 1.0 + sign * 0.1},
+        Fault.COMPASS: {"compass_rad": sign * math.radians(float(rng.uniform(10.0, 15.0)))},
+    }
+    return replace(drawn, **changes.get(drawn.fault, {}))
 
 
 def _lies(run_seed: int, number: int, chosen: Fault, share: float) -> frozenset[Fault]:
@@ -168,19 +167,16 @@ def _with_lies(drawn: FlightPlan, lies: frozenset[Fault]) -> FlightPlan:
     factor = math.exp(float(rng.uniform(*np.log(FOCAL_FACTORS))))
     turn_rad = math.radians(float(rng.choice([-90.0, 90.0, 180.0])))
     lag_s, towards = float(rng.uniform(*LAG_S)), float(rng.uniform(0.0, 2.0 * math.pi))
-    changes: dict[str, object] = {"lies": lies}
-    if Fault.SCALE in lies:
-        changes |= {"height_scale": scale}
-    if Fault.FOCAL in lies:
-        changes |= {"focal_error": 1.0 / factor - 1.0}
-    if Fault.HEADING in lies:
-        changes |= {"compass_rad": turn_rad}
-    if Fault.STALE in lies:
-        changes |= {"picture_lag_s": lag_s}
-    if Fault.START in lies:
-        error_m = (START_ERROR_M * math.sin(towards), START_ERROR_M * math.cos(towards))
-        changes |= {"start_sigma_m": START_SIGMA_M, "start_error_m": error_m}
-    return replace(drawn, **changes)  # type: ignore[arg-type]
+    start_error_m = (START_ERROR_M * math.sin(towards), START_ERROR_M * math.cos(towards))
+    changes: dict[Fault, dict[str, Any]] = {
+        Fault.SCALE: {"height_scale": scale},
+        Fault.FOCAL: {"focal_error": 1.0 / factor - 1.0},
+        Fault.HEADING: {"compass_rad": turn_rad},
+        Fault.STALE: {"picture_lag_s": lag_s},
+        Fault.START: {"start_sigma_m": START_SIGMA_M, "start_error_m": start_error_m},
+    }
+    changed = {name: value for lie in lies for name, value in changes.get(lie, {}).items()}
+    return replace(drawn, lies=lies, **changed)
 
 
 def _map_offset(run_seed: int, number: int, sigma_m: float) -> tuple[float, float]:

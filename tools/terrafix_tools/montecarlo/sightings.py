@@ -17,6 +17,7 @@ from terrafix.vision.two_view import RANSAC_PX, homography_inliers
 from terrafix_tools.montecarlo.flown import Shot
 from terrafix_tools.montecarlo.ground import Terrain
 from terrafix_tools.montecarlo.lens import Lens
+from terrafix_tools.sim.true_messages import first_odometry
 
 WHITE_PX = 0.30  # 1-sigma of a tracked coordinate in one frame, white
 SLIP_PX = 0.35  # ... and random walk of a track per root of a frame
@@ -163,14 +164,7 @@ class SimulatedOdometry:
         """The frame is a keyframe without a predecessor."""
         self._keyframe, self._misses = self._new_keyframe(frame_id, shot, blind=blind), 0
         self._fragment_id += 1
-        return Odometry(
-            t_ns=t_ns,
-            frame_id=frame_id,
-            keyframe_id=frame_id,
-            verdict=Verdict.ACCEPTED,
-            becomes_keyframe=True,
-            fragment_id=self._fragment_id,
-        )
+        return first_odometry(t_ns, frame_id, self._fragment_id)
 
     def _new_keyframe(self, frame_id: int, shot: Shot, *, blind: bool = False) -> _Keyframe:
         """A keyframe with random corners on the ground, on roofs and in tree crowns."""

@@ -1,8 +1,6 @@
 """Consistency of many flights: NEES and its chi-square band, coverage, false fixes, velocity, drift.
 
-NEES: normalised estimation error squared, the squared Mahalanobis distance of the error in the published covariance.
-Its mean is the number of dimensions when the covariance is consistent (Bar-Shalom, Li, Kirubarajan, "Estimation with
-Applications to Tracking and Navigation", 2001, 5.4). Errors of one flight are correlated in time, so N frames are not N
+Errors of one flight are correlated in time, so N frames are not N
 independent draws. The band is that of the effective number of draws, from the autocorrelation of the normalised
 error."""
 
@@ -13,21 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from terrafix.core.gate import CHI2_95
-from terrafix_tools.evaluate import FALSE_FIX_ERROR_M, FALSE_FIX_MAHALANOBIS2
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import Record
+from terrafix_tools.score import COVERAGE_FLOORS, INSIDE, coverage, is_false_fix, late_from_s, nees_band, nees_of
 
 POSE95 = 12.592  # chi-square with 6 degrees of freedom, 95 %
 NORMAL95 = 1.959964  # two-sided
 MAX_SIGMAS = 4.0  # errors are limited to this for the correlation
 MIN_DRIFT_PATH_M = 1000.0  # since the last map fix; a ratio over a shorter path has no meaning
-COVERAGE_FLOORS = (0.93, 0.98)
-CONSISTENT = 0.95  # share of the truth that a consistent covariance has inside its 95 % ellipse
 CONFIDENCE = 0.95  # two-sided, with which a share is judged to be another one
-# A false input is to be noticed within this time of its beginning, or within this many frames of new ground: a camera
-# above the same ground sees nothing new that could contradict it.
-NOTICE_S, NOTICE_FRAMES = 3.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -42,27 +34,10 @@ class Nees:
         return self.low <= self.mean <= self.high
 
 
-def nees_of(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """(N, k), (N, k, k) -> (N,); inf where ``cov`` is not positive definite."""
-    out = np.full(len(error), math.inf)
-    valid = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
-    valid[valid] &= np.linalg.eigvalsh(cov[valid])[:, 0] > 0.0
-    out[valid] = np.einsum("ni,ni->n", error[valid], np.linalg.solve(cov[valid], error[valid][..., None])[..., 0])
-    return out
-
-
 def band(flights: Sequence[np.ndarray], draws: float, dimensions: int) -> Nees:
     """Mean over the frames of all flights (N,), and the 95 % band of a mean of ``draws`` independent draws."""
     values = np.concatenate(flights) if flights else np.zeros(0)
-    freedom = max(draws * dimensions, 1.0)
-    low, high = (chi2(freedom, z) / max(draws, 1.0 / dimensions) for z in (-NORMAL95, NORMAL95))
-    return Nees(float(values.mean()) if len(values) else math.nan, low, high, draws)
-
-
-def chi2(freedom: float, z: float) -> float:
-    """Quantile of chi-square at the normal quantile ``z`` (Wilson and Hilferty 1931; good to 1 %)."""
-    a = 2.0 / (9.0 * freedom)
-    return freedom * max(0.0, 1.0 - a + z * math.sqrt(a)) ** 3
+    return Nees(float(values.mean()) if len(values) else math.nan, *nees_band(draws, dimensions), draws)
 
 
 def draws_in(flights: Sequence[np.ndarray]) -> float:
@@ -134,14 +109,12 @@ class FlightResult:
         start_s, times_s = self.record.lie_from_s, self.record.t_s
         if start_s is None:
             return self.false_fixes
-        since = times_s >= start_s
-        shown = np.cumsum(np.where(since, self.record.new_ground, 0.0))
-        excused = since & ((times_s - start_s <= NOTICE_S) | (shown <= NOTICE_FRAMES))
-        return int((self._false() & ~excused).sum())
+        allowed = (times_s >= start_s) & (times_s <= late_from_s(times_s.tolist(), start_s))
+        return int((self._false() & ~allowed).sum())
 
     def _false(self) -> np.ndarray:
         """(N,) bool"""
-        return np.asarray((self.distance_m > FALSE_FIX_ERROR_M) & (self.nees > FALSE_FIX_MAHALANOBIS2))
+        return is_false_fix(self.distance_m, self.nees)
 
     def refined_nees(self) -> np.ndarray:
         """(M,) of the frames that were refined."""
@@ -152,8 +125,7 @@ class FlightResult:
         """(M,) of the frames that the smoother has refined in flight, two degrees of freedom."""
         error_m, cov = self.record.smoothed_error_m, self.record.smoothed_cov
         refined = np.isfinite(error_m).all(axis=1)
-        solved = np.linalg.solve(cov[refined], error_m[refined][..., None])[..., 0]
-        return np.asarray(np.einsum("ni,ni->n", error_m[refined], solved))
+        return nees_of(error_m[refined], cov[refined])
 
     def velocity_share(self) -> np.ndarray:
         """(2N,) horizontal velocity errors in units of their 1-sigma."""
@@ -209,12 +181,12 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
         "late_false_fixes": sum(f.late_false_fixes for f in flights),
         "notice_s": max((f.notice_s for f in flights if f.notice_s is not None), default=None),
         "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
-        "coverage": float((nees <= CHI2_95).mean()),
-        "coverage_refined": float((refined <= CHI2_95).mean()) if len(refined) else None,
-        "coverage_smoothed": float((smoothed <= CHI2_95).mean()) if len(smoothed) else None,
+        "coverage": coverage(nees),
+        "coverage_refined": coverage(refined),
+        "coverage_smoothed": coverage(smoothed),
         "nees_smoothed": float(np.mean(smoothed)) if len(smoothed) else None,
-        "coverage_on_map": float((on_map <= CHI2_95).mean()),
-        "coverage_pose": float((pose <= POSE95).mean()),
+        "coverage_on_map": coverage(on_map),
+        "coverage_pose": coverage(pose, POSE95),
         "nees": _row(bands[0]),
         "nees_on_map": _row(bands[1]),
         "nees_pose": _row(bands[2]),
@@ -263,6 +235,6 @@ def _covers(share: float | None, draws: float) -> bool | None:
     if low <= share <= high:
         return True
     outside, count = (1.0 - share) * draws, max(1, round(draws))
-    chances = [math.comb(count, k) * (1.0 - CONSISTENT) ** k * CONSISTENT ** (count - k) for k in range(count + 1)]
+    chances = [math.comb(count, k) * (1.0 - INSIDE) ** k * INSIDE ** (count - k) for k in range(count + 1)]
     tail = sum(chances[math.ceil(outside - 1e-9) :]) if share < low else sum(chances[: math.floor(outside + 1e-9) + 1])
     return None if tail > 0.5 * (1.0 - CONFIDENCE) else False

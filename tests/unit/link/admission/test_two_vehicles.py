@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from link_rig import MS, covariance, estimate, texts
-from simulated_flight import CAMERA, ORIGIN, SIGMA_NORM, some_features
+from simulated_flight import CAMERA, KEYFRAME_EVERY, ORIGIN, keyframe_of, some_features
 from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.config import LinkSection
@@ -22,11 +22,11 @@ from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
 from terrafix_tools.sim.autopilot.course import PeerState
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
-from textured_ground import apply, homography
+from terrafix_tools.sim.true_messages import seen_from
 
 pytestmark = pytest.mark.real_time
 
-FRAME_S, KEYFRAME_EVERY = 0.5, 3
+FRAME_S = 0.5
 HEIGHT_M, SPEED_MPS = 100.0, 5.0
 DECIDES_WITHIN_S = 60.0  # generous: after 12 s on an idle computer
 SERVED_S = 3.0
@@ -88,21 +88,16 @@ class Camera:
         self._frame += 1
         r_w_c = rot_w_b(yaw_rad(t_s), 0.0, 0.0) @ Mount.of(CAMERA).r_b_c()
         self._views.append((r_w_c, np.array([0.0, SPEED_MPS * t_s, HEIGHT_M])))
-        keyframe = max(0, (i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY)
-        features = some_features()
-        noise = np.random.default_rng(i).normal(0.0, SIGMA_NORM, features.shape)
-        pairs = np.hstack([features, apply(homography(self._views[keyframe], self._views[i]), features) + noise])
+        keyframe = keyframe_of(i)
+        seen = seen_from(self._views[keyframe], self._views[i], np.random.default_rng(i), some_features())
         odometry = m.Odometry(
             t_ns=now_ns,
             frame_id=i,
             keyframe_id=keyframe,
             verdict=m.Verdict.ACCEPTED,
-            two_view=[(a, b, c, d) for a, b, c, d in pairs.tolist()] if i else [],
-            sigma_norm=SIGMA_NORM,
-            inliers=len(pairs),
-            tracked=len(pairs),
             becomes_keyframe=i % KEYFRAME_EVERY == 0,
             fragment_id=0,
+            **(seen if i else {**seen, "two_view": []}),
         )
         lat, lon = flying(t_s).lat_deg, flying(t_s).lon_deg
         velocity = (0.0, SPEED_MPS, 0.0)

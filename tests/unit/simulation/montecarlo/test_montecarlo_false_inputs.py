@@ -153,14 +153,14 @@ def test_frames_without_a_picture_are_no_evidence_against_the_position() -> None
     assert [m.verdict is Verdict.LOST for m in matches].index(True) == of.LOST_FRAMES - 1
 
 
-def judged(lie_from_s: float | None, false_at: list[int], new_ground: float = 1.0) -> FlightResult:
+def judged(lie_from_s: float | None, false_at: list[int]) -> FlightResult:
     """A flight of 40 frames, one a second, false at some."""
     n = 40
     error = np.zeros((n, 6))
     error[false_at, 0] = 80.0
     cov = np.tile(np.eye(6), (n, 1, 1))
     record = Record(
-        plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n), new_ground=np.full(n, new_ground),
+        plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n),
         truth_m=np.zeros((n, 2)), error_m=error, cov=cov, velocity_error_mps=np.zeros((n, 3)),
         velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1), refined_error_m=np.zeros((n, 2)),
         refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n), memory_mb=np.zeros(n), lie_from_s=lie_from_s)  # fmt: skip
@@ -173,9 +173,8 @@ def test_time_to_notice_ends_at_the_last_false_fix_after_the_start_of_the_false_
     assert judged(None, [12]).notice_s is None
 
 
-def test_false_fixes_are_late_after_three_seconds_and_five_frames_of_new_ground() -> None:
+def test_false_fixes_are_late_after_three_seconds_and_five_frames() -> None:
     assert judged(10.0, [10, 13, 14]).late_false_fixes == 0  # the fifth frame is that of 14 s
     assert judged(10.0, [14, 15, 30]).late_false_fixes == 2
-    assert judged(10.0, [15, 19, 20], new_ground=0.5).late_false_fixes == 1
     assert judged(10.0, [9]).late_false_fixes == 1  # before the lie
     assert judged(None, [0, 1]).late_false_fixes == 2

@@ -9,17 +9,15 @@ from terrafix_tools.montecarlo.endurance import RestartComparison, slopes
 from terrafix_tools.montecarlo.fault import Fault
 from terrafix_tools.montecarlo.flight import run
 from terrafix_tools.montecarlo.plan import plan
-from terrafix_tools.montecarlo.statistics import band, chi2, draws_in, floors, nees_of, whitened
-
-Z975 = 1.959964
+from terrafix_tools.montecarlo.statistics import band, draws_in, floors, whitened
+from terrafix_tools.score import nees_band, nees_of
 
 
 @pytest.mark.parametrize(
     ("freedom", "low", "high"), [(2, 0.0506, 7.378), (10, 3.247, 20.483), (100, 74.222, 129.561), (1000, 914.3, 1089.5)]
 )
 def test_chi_square_quantiles_are_those_of_the_tables(freedom: int, low: float, high: float) -> None:
-    assert chi2(freedom, -Z975) == pytest.approx(low, rel=0.01, abs=0.04)
-    assert chi2(freedom, Z975) == pytest.approx(high, rel=0.01)
+    assert freedom * np.array(nees_band(freedom, 1)) == pytest.approx([low, high], rel=1e-3)
 
 
 def test_nees_is_the_mahalanobis_distance_and_no_covariance_is_infinite() -> None:

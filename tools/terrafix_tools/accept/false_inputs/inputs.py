@@ -21,7 +21,9 @@ from terrafix_tools.accept.measuring.results import Span
 
 FEET_IN_A_METRE = 3.28084
 NOISE_GREY = 2.0  # 1-sigma of a picture's noise from frame to frame, grey values: a small camera by day
+FOREIGN_LAG_S = 25.0  # longer than the span of a lie in the closed loop: no picture comes from the span itself
 FOCAL_SIGMA = 0.01  # stated relative 1-sigma of a wrong focal length
+SEED = 1  # of the choice of foreign and dropped frames, and of noise
 DOUBLED_SUFFIX = "again"  # appended to the file name of a doubled picture
 
 OriginEdit = Callable[[Origin], Origin]
@@ -55,7 +57,7 @@ def every_picture(change: Callable[[Image], Image]) -> Edit:
     return edit
 
 
-def stale_buffers(span: Span, buffers: int, *, noise_grey: float, seed: int) -> Edit:
+def stale_buffers(span: Span, buffers: int, *, noise_grey: float = NOISE_GREY, seed: int = SEED) -> Edit:
     """In ``span`` the camera delivers the last ``buffers`` pictures before it in turn, each with new noise.
 
     One buffer is a frozen camera. ``noise_grey``: 1-sigma of the noise in grey values; 0: identical pictures."""
@@ -93,17 +95,6 @@ def late_pictures(lag_s: float) -> Edit:
     return edit
 
 
-def during(span: Span, edit: Edit) -> Edit:
-    """``edit``, which must give one shot for each shot, is computed over the whole flight and used in ``span`` only."""
-
-    def edited(shots: Iterator[Shot]) -> Iterator[Shot]:
-        true, seen = tee(shots)
-        for shot, changed in zip(true, edit(seen), strict=True):
-            yield changed if span.has(shot.frame.t_ns / 1e9) else shot
-
-    return edited
-
-
 def slow_pictures(span: Span, speed: float) -> Edit:
     """In ``span`` the pictures play at ``speed`` (below 1) times the true one, so that their delay grows until the end
     of the span. Times and telemetry are true."""
@@ -122,6 +113,32 @@ def slow_pictures(span: Span, speed: float) -> Edit:
             yield replace(shot, image=held[0][1])
 
     return edit
+
+
+def black(span: Span) -> Edit:
+    """Black pictures in ``span``: a covered lens, or night."""
+    return during(span, every_picture(np.zeros_like))
+
+
+def frozen(span: Span) -> Edit:
+    """In ``span`` the camera repeats the last picture before it."""
+    return stale_buffers(span, 1, noise_grey=0.0)
+
+
+def during(span: Span, edit: Edit) -> Edit:
+    """``edit``, which must give one shot for each shot, is computed over the whole flight and used in ``span`` only."""
+
+    def edited(shots: Iterator[Shot]) -> Iterator[Shot]:
+        true, seen = tee(shots)
+        for shot, changed in zip(true, edit(seen), strict=True):
+            yield changed if span.has(shot.frame.t_ns / 1e9) else shot
+
+    return edited
+
+
+def mirrored_before(span: Span) -> Edit:
+    """In ``span`` self-consistent pictures of another camera: the flight's own of FOREIGN_LAG_S before, mirrored."""
+    return during(span, lambda shots: every_picture(mirrored)(late_pictures(FOREIGN_LAG_S)(shots)))
 
 
 def partly_frozen(share: float, seed: int) -> Edit:

@@ -8,9 +8,8 @@ import numpy as np
 
 from terrafix_tools.accept.measuring.evidence import Evidence, FrameEvidence
 from terrafix_tools.accept.measuring.results import Measured, Span, Verdict
-from terrafix_tools.evaluate import FALSE_FIX_ERROR_M, is_false_fix
+from terrafix_tools.score import FALSE_FIX_ERROR_M, late_from_s
 
-ALLOWED_S, ALLOWED_FRAMES = 3.0, 5  # from the start of the lie: allowed time to withdraw the fix
 RECOVERED_M, RECOVERED_FRAMES = 20.0, 3  # recovered: below this error and not false, for this many consecutive frames
 LAST_SHARE = 0.1  # of the frames: an error there counts as permanent
 LATE_M = 20.0  # pictures with a delay of 1 s cause errors above this, and below 50 m
@@ -97,7 +96,7 @@ def claim_width(e: Evidence) -> Measured:
 
 def is_false(frame: FrameEvidence, beyond_m: float = FALSE_FIX_ERROR_M) -> bool:
     """Whether the frame is a false fix; without truth it is not."""
-    return frame.compared is not None and is_false_fix(frame.compared, beyond_m)
+    return frame.compared is not None and frame.compared.is_false(beyond_m)
 
 
 def in_lie(e: Evidence, frame: FrameEvidence) -> bool:
@@ -105,11 +104,10 @@ def in_lie(e: Evidence, frame: FrameEvidence) -> bool:
 
 
 def _late(e: Evidence, beyond_m: float) -> Measured:
-    lie = lie_of(e)
-    since = [f for f in e.frames if f.t_s >= lie.from_s]
-    allowed = {id(f) for n, f in enumerate(since) if n < ALLOWED_FRAMES or f.t_s <= lie.from_s + ALLOWED_S}
+    from_s = lie_of(e).from_s
+    late_s = late_from_s([f.t_s for f in e.frames], from_s)
     wrong = [f for f in e.frames if is_false(f, beyond_m)]
-    late = [f for f in wrong if id(f) not in allowed]
+    late = [f for f in wrong if not from_s <= f.t_s <= late_s]
     worst_m = max((f.error_m for f in late if f.error_m is not None), default=0.0)
     return Measured(float(len(late)), f"of {len(wrong)}; {worst_m:.0f} m at worst" if late else f"of {len(wrong)}")
 

@@ -3,12 +3,11 @@
 A false GPS_INPUT has a 3D fix with an error of more than 50 m and more than 3 times its stated accuracy. The deviation
 ("aside") is the distance from the trajectory of the same vehicle with GNSS, in the same wind and without the lie."""
 
-from terrafix_tools.accept.false_inputs.integrity import ALLOWED_FRAMES, ALLOWED_S, RECOVERED_M, lie_of
+from terrafix_tools.accept.false_inputs.integrity import RECOVERED_M, lie_of
 from terrafix_tools.accept.measuring.evidence import Evidence, SentFix
 from terrafix_tools.accept.measuring.results import Measured, Verdict
-from terrafix_tools.evaluate import FALSE_FIX_ERROR_M
+from terrafix_tools.score import FALSE_FIX_ERROR_M, FALSE_FIX_SIGMAS, late_from_s
 
-FALSE_FIX_SIGMAS = 3.0
 STEADY_S = 1.0  # recovered: for this time without interruption
 
 NOT_FLOWN = Measured(None, "no GPS_INPUT was sent", Verdict.BELOW)
@@ -42,8 +41,7 @@ def late_false_fixes_sent(e: Evidence) -> Measured:
     if not e.sent:
         return NOT_FLOWN
     lie = lie_of(e)
-    first_frames = [f.t_s for f in e.frames if lie.has(f.t_s)][:ALLOWED_FRAMES]
-    until_s = min(lie.to_s, max([lie.from_s + ALLOWED_S, *first_frames[-1:]]))
+    until_s = min(lie.to_s, late_from_s([f.t_s for f in e.frames], lie.from_s))
     wrong = [s for s in e.sent if is_false_gps_input(s)]
     late = [s for s in wrong if not lie.from_s <= s.t_s <= until_s]
     if not late:

@@ -1,10 +1,12 @@
-"""False maps: of another place, in a wrong datum, of a wrong scale. Each function writes a GeoTIFF from the flight's.
+"""False maps: of another place, in a wrong datum, of a wrong scale, with other ground along a part of the route.
 
-Every function returns the reason why it cannot be done, or "". Raises MapError."""
+Each function writes a GeoTIFF from the flight's, and returns the reason why it cannot be done, or "". Raises MapError.
+"""
 
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import rasterio
 from rasterio.errors import RasterioIOError
@@ -12,10 +14,12 @@ from rasterio.transform import Affine
 from rasterio.warp import transform as warped
 
 from terrafix.core.errors import MapError
-from terrafix_tools.accept.faults.stale_map import LARGEST_PX
 from terrafix_tools.evaluate import Truth
 
 TOO_LARGE = "the map is too large to be changed in memory"
+METRES_PER_DEGREE = 111_320.0
+LARGEST_PX = 120_000_000  # of one band: the whole raster is kept in memory
+REACH = 0.75  # of the footprint's diagonal: the ground of a frame, and the search area beside it
 
 
 def mirrored(given: Path, out: Path) -> str:
@@ -65,6 +69,21 @@ def put_in_place_of(other: Path, given: Path, out: Path) -> str:
     return _write(out, image, theirs | {"crs": ours["crs"], "transform": corner @ Affine.scale(size_x, -size_y)})
 
 
+def stale_along(given: Path, out: Path, stretch: list[Truth], footprint_m: float) -> str:
+    """The same picture, rotated by 180 degrees around ``stretch``: real ground of the same kind at a wrong place."""
+    image, profile = _read(given)
+    if image is None:
+        return "the map is too large to be turned around in memory"
+    x, y = warped("EPSG:4326", profile["crs"], [t.lon_deg for t in stretch], [t.lat_deg for t in stretch])
+    points = np.round(np.array([~profile["transform"] @ at for at in zip(x, y, strict=True)])).astype(np.int32)
+    pixel_m = abs(float(profile["transform"].a))
+    if profile["crs"].is_geographic:
+        pixel_m *= METRES_PER_DEGREE * float(np.cos(np.radians(stretch[0].lat_deg)))
+    mask = np.zeros(image.shape[1:], np.uint8)
+    cv2.polylines(mask, [points.reshape(-1, 1, 2)], False, 255, max(1, round(2 * REACH * footprint_m / pixel_m)))
+    return _write(out, np.where(mask[None] > 0, image[:, ::-1, ::-1], image), profile)
+
+
 def _read(path: Path) -> tuple[np.ndarray | None, dict[str, Any]]:
     """-> (bands, H, W), None if it is too large for memory; and rasterio's profile."""
     try:
@@ -88,8 +107,7 @@ def _units_per_metre(profile: dict[str, Any]) -> tuple[float, float]:
     """Units of the map's coordinates per metre east and per metre north, at its centre."""
     middle = profile["transform"] @ (profile["width"] / 2, profile["height"] / 2)
     (lon,), (lat,) = warped(profile["crs"], "EPSG:4326", [middle[0]], [middle[1]])
-    per_degree_m = 111_320.0
     step = 1e-4  # degrees
     (x0, x1, x2), (y0, y1, y2) = warped("EPSG:4326", profile["crs"], [lon, lon + step, lon], [lat, lat, lat + step])
-    east_m, north_m = step * per_degree_m * float(np.cos(np.radians(lat))), step * per_degree_m
+    east_m, north_m = step * METRES_PER_DEGREE * float(np.cos(np.radians(lat))), step * METRES_PER_DEGREE
     return float(np.hypot(x1 - x0, y1 - y0)) / east_m, float(np.hypot(x2 - x0, y2 - y0)) / north_m

@@ -26,7 +26,6 @@ START_ERROR_M = np.array([212.0, 212.0])  # 300 m
 START_SIGMA_M = 50.0
 PHOTO_M = 155.0
 GAP_FRAMES, GAP_MORE_S = 16, 170.0
-SEED = 1  # of the choice of foreign and dropped frames, and of noise
 
 
 def _too_short(flight: Flight) -> str:
@@ -84,22 +83,18 @@ def _pictures_of(flight: Flight, shown: dict[int, int], change: Callable[[Image]
     return _lying(_span(flight, min(shown), max(shown), text), edit=lying.replaced(pictures))
 
 
-def foreign_row(flight: Flight) -> Plan | str:
-    start = flight.at(START)
-    return _another_camera(flight, list(range(start, start + FOREIGN_ROW)))
+def foreign_row(at: float = START, pace: int = 1) -> Callable[[Flight], Plan | str]:
+    """From the share ``at`` of the frames on."""
 
+    def plan(flight: Flight) -> Plan | str:
+        start = flight.at(at)
+        return _another_camera(flight, list(range(start, start + FOREIGN_ROW)), pace)
 
-def fast_foreign_row(flight: Flight) -> Plan | str:
-    start = flight.at(START)
-    return _another_camera(flight, list(range(start, start + FOREIGN_ROW)), FAST)
-
-
-def foreign_start(flight: Flight) -> Plan | str:
-    return _another_camera(flight, list(range(FOREIGN_ROW)))
+    return plan
 
 
 def foreign_at_random(flight: Flight) -> Plan | str:
-    drawn = np.random.default_rng([SEED, 70]).uniform(size=len(flight.frame_refs)) < FOREIGN_SHARE
+    drawn = np.random.default_rng([lying.SEED, 70]).uniform(size=len(flight.frame_refs)) < FOREIGN_SHARE
     numbers = [int(n) for n in np.flatnonzero(drawn) if 0.1 <= n / len(flight.frame_refs) <= 0.8]
     return _another_camera(flight, numbers) if numbers else "too few frames to have a foreign one"
 
@@ -194,9 +189,3 @@ def gap_of_minutes(flight: Flight) -> Plan | str:
     # The span ends before the first frame after the gap.
     gap = Span(span.from_s, span.to_s - 1e-3, span.text)
     return Plan(lying.pause(first, end, GAP_MORE_S), marks=Marks(spans=(gap,)))
-
-
-def true_inputs(
-    edit: Edit = flight_edits.unchanged, origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin
-) -> Callable[[Flight], Plan]:
-    return lambda _: Plan(edit, origin)

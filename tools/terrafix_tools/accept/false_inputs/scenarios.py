@@ -2,14 +2,17 @@
 
 The last group has true inputs with gaps: the position must stay correct."""
 
+from collections.abc import Callable
 from functools import partial
 
 from terrafix_tools.accept.false_inputs import inputs as lying
 from terrafix_tools.accept.false_inputs import plans
-from terrafix_tools.accept.false_inputs.plans import SEED, START_SIGMA_M
+from terrafix_tools.accept.false_inputs.plans import START_SIGMA_M
 from terrafix_tools.accept.faults import flight_edits
+from terrafix_tools.accept.faults.flight_edits import Edit
 from terrafix_tools.accept.measuring.criteria import EVERYWHERE, LYING_IN_THE_LOOP, PERMANENT, TEMPORARY
-from terrafix_tools.accept.plan import CLOSED_LOOP, Plan, Scenario
+from terrafix_tools.accept.measuring.results import Span
+from terrafix_tools.accept.plan import CLOSED_LOOP, Scenario, always
 
 FRAMES = 90  # of a generated flight: 45 s
 LOOP_FRAMES = 200  # 100 s: 40 s with GNSS, 20 s jammed, 15 s with the lie, and 25 s to recover
@@ -27,22 +30,34 @@ HEIGHTS = (
     ("height in feet", "The reported height is in feet where metres are expected.", lying.FEET_IN_A_METRE),
     ("height taken for feet", "The reported height was divided by 3.28 once too often.", 1.0 / lying.FEET_IN_A_METRE),
 )
-IN_THE_LOOP: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    ("GNSS jam, frozen picture", "one picture again and again, with new noise", ()),
-    ("GNSS jam, four stale buffers", "four pictures in turn", ()),
-    ("GNSS jam, foreign frames", "pictures of another place that agree with each other", ()),
-    ("GNSS jam, late pictures", "pictures that are a second old", ("late sure over 20 m",)),
+# Pictures in the closed loop, while GNSS is jammed and the autopilot navigates by Terrafix: what they show, rows, edit
+IN_THE_LOOP: tuple[tuple[str, str, tuple[str, ...], Callable[[Span], Edit]], ...] = (
+    (
+        "GNSS jam, frozen picture",
+        "one picture again and again, with new noise",
+        (),
+        partial(lying.stale_buffers, buffers=1),
+    ),
+    ("GNSS jam, four stale buffers", "four pictures in turn", (), partial(lying.stale_buffers, buffers=BUFFERS)),
+    ("GNSS jam, foreign frames", "pictures of another place that agree with each other", (), lying.mirrored_before),
+    (
+        "GNSS jam, late pictures",
+        "pictures that are a second old",
+        ("late sure over 20 m",),
+        lambda span: lying.during(span, lying.late_pictures(LATE_S)),
+    ),
 )
+LIES_IN_THE_LOOP = {name: edit for name, _, _, edit in IN_THE_LOOP}
 LIES: tuple[Scenario, ...] = (
-    _scenario("ten foreign frames", "Ten frames in a row show another place.", TEMPORARY, plans.foreign_row),
+    _scenario("ten foreign frames", "Ten frames in a row show another place.", TEMPORARY, plans.foreign_row()),
     _scenario(
         "fast foreign frames",
         "Ten frames in a row show another place, at three times the speed.",
         TEMPORARY,
-        plans.fast_foreign_row,
+        plans.foreign_row(pace=plans.FAST),
     ),
     _scenario(
-        "foreign frames at the start", "The first ten frames show another place.", TEMPORARY, plans.foreign_start
+        "foreign frames at the start", "The first ten frames show another place.", TEMPORARY, plans.foreign_row(at=0.0)
     ),
     _scenario(
         "15 % foreign frames",
@@ -145,29 +160,25 @@ LIES: tuple[Scenario, ...] = (
         "frozen picture with noise",
         "The camera repeats one picture for 15 s, with new noise each time.",
         TEMPORARY,
-        plans.for_seconds(
-            FROZEN_S, "frozen", lambda span: lying.stale_buffers(span, 1, noise_grey=lying.NOISE_GREY, seed=SEED)
-        ),
+        plans.for_seconds(FROZEN_S, "frozen", partial(lying.stale_buffers, buffers=1)),
     ),
     _scenario(
         "four stale buffers",
         "The camera repeats four pictures in turn for 15 s.",
         TEMPORARY,
-        plans.for_seconds(
-            FROZEN_S, "stale", lambda span: lying.stale_buffers(span, BUFFERS, noise_grey=lying.NOISE_GREY, seed=SEED)
-        ),
+        plans.for_seconds(FROZEN_S, "stale", partial(lying.stale_buffers, buffers=BUFFERS)),
     ),
     _scenario(
         "camera falls behind",
         "For 15 s the pictures play at half their speed, then the camera is live.",
         TEMPORARY,
-        plans.for_seconds(FROZEN_S, "slow", lambda span: lying.slow_pictures(span, HALF_SPEED)),
+        plans.for_seconds(FROZEN_S, "slow", partial(lying.slow_pictures, speed=HALF_SPEED)),
     ),
     _scenario(
         "half the picture stands still",
         "The lower half of every picture shows a part of the vehicle, from the first frame on.",
         PERMANENT,
-        plans.throughout("half of it stands still", edit=lying.partly_frozen(STILL_SHARE, SEED)),
+        plans.throughout("half of it stands still", edit=lying.partly_frozen(STILL_SHARE, lying.SEED)),
     ),
     _scenario(
         "telemetry 2 s late",
@@ -197,7 +208,7 @@ LIES: tuple[Scenario, ...] = (
         "dropped and doubled frames",
         "15 % of the frames are missing, 15 % come twice.",
         SCARCE,
-        plans.true_inputs(lying.dropped_and_doubled(DROPPED, DOUBLED, SEED)),
+        always(lying.dropped_and_doubled(DROPPED, DOUBLED, lying.SEED)),
     ),
     _scenario(
         "photos every 155 m",
@@ -213,23 +224,23 @@ LIES: tuple[Scenario, ...] = (
         "height unknown",
         "No height is reported.",
         SCARCE,
-        plans.true_inputs(flight_edits.telemetry(lying.height_unknown)),
+        always(flight_edits.telemetry(lying.height_unknown)),
     ),
     _scenario(
         "start unknown",
         "No start is known.",
         (*SCARCE, "first position"),
-        plans.true_inputs(origin=lying.start_unknown),
+        always(origin=lying.start_unknown),
     ),
     *(
         Scenario(
             name,
             f"In flight, with nothing but Terrafix, for 15 s: {text}. Closed loop.",
             (*LYING_IN_THE_LOOP, *more),
-            lambda _: Plan(),
+            always(),
             ground=CLOSED_LOOP,
             frames=LOOP_FRAMES,
         )
-        for name, text, more in IN_THE_LOOP
+        for name, text, more, _ in IN_THE_LOOP
     ),
 )

@@ -10,14 +10,12 @@ from itertools import islice
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
 from terrafix.messages import Origin, VehicleState
 from terrafix.vision.sources import Shot, Source
 from terrafix_tools.accept.flight import FrameRef
-from terrafix_tools.accept.measuring.results import Span
 
 Edit = Callable[[Iterator[Shot]], Iterator[Shot]]
 StateEdit = Callable[[VehicleState], VehicleState]
@@ -144,32 +142,6 @@ def without_frames(files: frozenset[str]) -> Edit:
             if shot.frame.file not in files:
                 yield replace(shot, states=pending)
                 pending = ()
-
-    return edit
-
-
-def black(span: Span) -> Edit:
-    """Black pictures in ``span``: a covered lens, or night."""
-
-    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
-        for shot in shots:
-            seen = shot.image is not None and span.has(shot.frame.t_ns / 1e9)
-            yield replace(shot, image=np.zeros_like(shot.image)) if seen else shot
-
-    return edit
-
-
-def frozen(span: Span) -> Edit:
-    """In ``span`` the camera repeats the last picture before it, with new times."""
-
-    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
-        last = None
-        for shot in shots:
-            if last is not None and span.has(shot.frame.t_ns / 1e9):
-                yield replace(shot, image=last)
-            else:
-                last = shot.image if shot.image is not None else last
-                yield shot
 
     return edit
 

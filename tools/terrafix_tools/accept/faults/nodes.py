@@ -7,8 +7,9 @@ import numpy as np
 
 from terrafix.core.node import Node
 from terrafix.core.pnp import solved
-from terrafix.messages import Frame, Health, MapMatch, MapPose, MatchPlace, Message, Prediction, ThermalBand, Verdict
+from terrafix.messages import Frame, Health, MapMatch, Message, Prediction, ThermalBand
 from terrafix_tools.accept.measuring.results import Span
+from terrafix_tools.sim.true_messages import placed
 
 OUTLIER_M = 350.0  # AC-3
 OUTLIER_SIGMA_M, OUTLIER_SIGMA_RAD = 2.0, 0.01  # stated 1-sigma of the wrong fix
@@ -34,18 +35,10 @@ class WrongFixes:
     def _with_offset(self, prediction: Prediction, match: MapMatch) -> MapMatch:
         towards = self._rng.uniform(0.0, 2.0 * np.pi)
         near = solved(match).pose or prediction
-        e_m, n_m, up_m = near.p_c_in_w_m
-        e_m, n_m = e_m + OUTLIER_M * float(np.sin(towards)), n_m + OUTLIER_M * float(np.cos(towards))
-        cov = np.diag([OUTLIER_SIGMA_M**2] * 3 + [OUTLIER_SIGMA_RAD**2] * 3)
-        return msgspec.structs.replace(
-            match,
-            verdict=Verdict.ACCEPTED,
-            matches=[],
-            pnp=None,
-            inliers=48,
-            pose=MapPose(p_c_in_w_m=(e_m, n_m, up_m), q_w_c=near.q_w_c, cov=tuple(float(v) for v in cov.ravel())),
-            place=MatchPlace(e_m=e_m, n_m=n_m, mass=0.99),
-        )
+        there_m = np.array(near.p_c_in_w_m) + OUTLIER_M * np.array([np.sin(towards), np.cos(towards), 0.0])
+        sigmas = np.array([OUTLIER_SIGMA_M] * 3 + [OUTLIER_SIGMA_RAD] * 3)
+        without = msgspec.structs.replace(match, matches=[], pnp=None)
+        return placed(without, there_m, near.q_w_c, sigmas, inliers=48)
 
 
 class FrameNames:

@@ -32,6 +32,14 @@ class PeerState:
     airspeed_mps: float = math.nan  # nan: unknown, as without sensor
 
 
+def peer_state_of(state: State, frame: LocalFrame) -> PeerState:
+    """``frame``: of the position of ``state``."""
+    e_m, n_m, up_m = state.p_b_in_w_m.tolist()
+    ve, vn, vu = state.velocity_enu_mps.tolist()
+    angles = state.yaw_rad, state.pitch_rad, state.roll_rad
+    return PeerState(*frame.to_wgs84(e_m, n_m), up_m, state.agl_m, *angles, vn, ve, -vu, state.airspeed_mps)
+
+
 Course = Callable[[float], PeerState]  # seconds of the flight -> true state
 
 COLUMNS = ("t_s", *(f.name for f in fields(PeerState)))

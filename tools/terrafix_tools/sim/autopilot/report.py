@@ -1,7 +1,6 @@
 """Monitors an autopilot in flight: the GPS_INPUT that it receives, and its position error."""
 
 import json
-import math
 from collections import deque
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 
 from terrafix.core.errors import OutputError
 from terrafix.core.geodesy import LocalFrame
+from terrafix_tools.score import FALSE_FIX_SIGMAS, quantile
 from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
 from terrafix_tools.sim.autopilot.navigation.gps import GpsInputDriver
 from terrafix_tools.sim.interfaces import State
@@ -142,7 +142,7 @@ class PeerMonitor:
             gps_error_median_m=quantile(gps_errors, 0.5),
             gps_error_p95_m=quantile(gps_errors, 0.95),
             gps_error_max_m=max(gps_errors, default=None),
-            fixes_beyond_3_sigma=sum(fix.error_m > 3.0 * (fix.horizontal_m or 0.0) for fix in self.fixes),
+            fixes_beyond_3_sigma=sum(fix.error_m > FALSE_FIX_SIGMAS * (fix.horizontal_m or 0.0) for fix in self.fixes),
             position_error_median_m=quantile(errors, 0.5),
             position_error_p95_m=quantile(errors, 0.95),
             position_error_max_m=max(errors, default=None),
@@ -171,10 +171,3 @@ class PeerMonitor:
         """Returns the true position (2,) east, north at a time of the last second."""
         at_s, position, velocity = min(self._truths, key=lambda sample: abs(sample[0] - t_s))
         return position + velocity * (t_s - at_s)
-
-
-def quantile(values: list[float], share: float) -> float | None:
-    """Nearest rank quantile; None without values."""
-    if not values:
-        return None
-    return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]

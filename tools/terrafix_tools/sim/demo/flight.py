@@ -10,7 +10,7 @@ from rich.console import Console
 
 from terrafix.messages import ProcessEvent
 from terrafix.runtime import supervisor
-from terrafix_tools.sim.autopilot.course import PeerState
+from terrafix_tools.sim.autopilot.course import PeerState, peer_state_of
 from terrafix_tools.sim.autopilot.peer import AutopilotPeer
 from terrafix_tools.sim.autopilot.report import PeerReport
 from terrafix_tools.sim.flights.folder import Flight
@@ -48,23 +48,7 @@ class Course:
         self._flight = flight
 
     def __call__(self, t_s: float) -> PeerState:
-        truth = self._flight.path.state(t_s)
-        e_m, n_m, up_m = (float(v) for v in truth.p_b_in_w_m)
-        ve, vn, vu = (float(v) for v in truth.velocity_enu_mps)
-        lat_deg, lon_deg = self._flight.frame.to_wgs84(e_m, n_m)
-        state = PeerState(
-            lat_deg=lat_deg,
-            lon_deg=lon_deg,
-            amsl_m=up_m,
-            agl_m=truth.agl_m,
-            yaw_rad=truth.yaw_rad,
-            pitch_rad=truth.pitch_rad,
-            roll_rad=truth.roll_rad,
-            vn_mps=vn,
-            ve_mps=ve,
-            vd_mps=-vu,
-            airspeed_mps=truth.airspeed_mps,
-        )
+        state = peer_state_of(self._flight.path.state(t_s), self._flight.frame)
         return state if t_s > 0.0 else replace(state, vn_mps=0.0, ve_mps=0.0, vd_mps=0.0, airspeed_mps=0.0)
 
 

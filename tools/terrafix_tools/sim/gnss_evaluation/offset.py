@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 
-from terrafix.core.gate import CHI2_95
+from terrafix_tools.score import coverage
 from terrafix_tools.sim.gnss_evaluation.flight import Vision, fly
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Outage
 
@@ -57,7 +57,7 @@ def _summary(flights: list[np.ndarray]) -> dict[str, float]:
         "max_m": round(float(np.max(off_m)), 2),
         "claimed_sigma_m": round(float(np.median(rows[:, 3])), 2),
         "nees": round(float(np.mean(squared)), 2),
-        "inside_95": round(float(np.mean(squared <= CHI2_95)), 3),
+        "inside_95": round(coverage(squared) or 0.0, 3),
     }
 
 

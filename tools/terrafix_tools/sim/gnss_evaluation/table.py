@@ -13,6 +13,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from terrafix.messages import GnssState
+from terrafix_tools.score import quantile
 from terrafix_tools.sim.gnss_evaluation.flight import DetectorResult, Vision, fly
 from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Jam, Jump, Outage
 
@@ -126,9 +127,9 @@ def summary(result: Table) -> dict[str, object]:
 
 
 def _quantiles(seconds: list[float]) -> dict[str, float]:
-    ordered = sorted(seconds)
-    p95 = ordered[min(len(ordered) - 1, math.ceil(0.95 * len(ordered)) - 1)]
-    values = {"least": ordered[0], "median": statistics.median(ordered), "p95": p95, "worst": ordered[-1]}
+    p95 = quantile(seconds, 0.95)
+    assert p95 is not None
+    values = {"least": min(seconds), "median": statistics.median(seconds), "p95": p95, "worst": max(seconds)}
     return {name: round(value, 2) for name, value in values.items()}
 
 

@@ -8,7 +8,7 @@ import msgspec
 
 from terrafix.messages import GpsInput, Message, ProcessEvent
 from terrafix.recorder.reader import read_flight
-from terrafix_tools.sim.autopilot.report import quantile
+from terrafix_tools.score import quantile
 
 MEDIAN_MS, P99_MS, GAP_MS = 100.0, 120.0, 245.0  # AC-14; the autopilot reports a GPS as unhealthy after two longer gaps
 MEDIAN_WITHIN_MS = 2.0
