@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rasterio.transform import Affine
-from terrafix.anchor.relocalization.hypothesis_tracker import MERGE_RADIUS
 
 import map_rasters
 from terrafix.anchor.relocalization.map_search import MapSearch
+from terrafix.anchor.verification.hypothesis_tracker import MERGE_RADIUS
 from terrafix.core.errors import MapError
 from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget
 from textured_ground import texture
