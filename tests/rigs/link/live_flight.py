@@ -11,8 +11,9 @@ from terrafix.link.integrity.output_predictor import offset
 from terrafix_tools.sim.autopilot.course import PeerState
 
 
-def eastward(t_s: float) -> PeerState:
-    lat, lon = offset(LAT, LON, SPEED_EAST * t_s, 0.0)
+def eastward(t_s: float, north_m: float = 0.0) -> PeerState:
+    """``north_m``: north of the course of the estimates."""
+    lat, lon = offset(LAT, LON, SPEED_EAST * t_s, north_m)
     return PeerState(lat, lon, ALT, 120.0, math.pi / 2, 0.02, 0.0, 0.0, SPEED_EAST, 0.0)
 
 

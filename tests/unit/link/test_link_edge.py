@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Iterator
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -18,14 +19,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gps_messages import GPS
 from link_port import Speaker, free_port
-from link_rig import MS, S
+from link_rig import ALT, MS, S, live
 from link_wire import attitude, heartbeat, states, station_heartbeat
+from live_flight import LiveFlight
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
 from terrafix.link.edge import MavlinkEdge, open_edge
 from terrafix.link.mavlink.transport import UdpOut, open_transport
+from terrafix.link.node import LinkNode
 from terrafix.link.output import gps_input
+from terrafix.link.output.gps_time import week_and_ms
 
 pytestmark = pytest.mark.real_time
 
@@ -405,6 +409,18 @@ def test_tcp_reconnects_without_blocking() -> None:
     edge.close()
     peer.close()
     server.close()
+
+
+def test_node_and_edge_together_send_10_hz_with_week_and_position(station: Speaker, edge: MavlinkEdge) -> None:
+    live(LinkNode(10.0), edge, 1.5, LiveFlight().feed)
+    sent = station.received("GPS_INPUT")
+    assert 5 <= len(sent) <= 17
+    good = [g for g in sent if g.fix_type == 3]
+    assert len(good) >= len(sent) - 3
+    assert all(g.alt == pytest.approx(ALT) and g.ve == 20.0 and g.satellites_visible == 6 for g in good)
+    assert {g.time_week for g in sent} == {week_and_ms(UNIX_NS)[0]}
+    for a, b in pairwise(sent):  # GPS time advances with the clock of the prediction
+        assert b.time_week_ms - a.time_week_ms == pytest.approx((b.time_usec - a.time_usec) / 1e3, abs=1.0)
 
 
 def test_udp_send_without_a_listener_does_not_raise() -> None:

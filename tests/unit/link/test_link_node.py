@@ -70,6 +70,12 @@ def test_late_estimates_at_2_hz_give_accurate_gps_input_at_10_hz() -> None:
     assert {v.verdict for v in verdicts(published)} == {m.Verdict.ACCEPTED}
 
 
+def test_no_position_is_sent_twice() -> None:
+    published = fly(LinkNode(10.0), 0, 10 * S, every(S // 2, estimate))
+    places = [(g.lat_deg, g.lon_deg) for g in gps(published) if g.fix_type == 3]
+    assert len(places) == len(set(places)) > 90
+
+
 def test_the_link_node_is_deterministic() -> None:
     feed = every(300 * MS, lambda t: estimate(t, east_m=math.sin(t / S) * 3))
     assert fly(LinkNode(10.0), 0, 30 * S, feed) == fly(LinkNode(10.0), 0, 30 * S, feed)

@@ -1,5 +1,7 @@
 """Forgers beside the real link (node and edge) and the simulated autopilot, in real time and on real sockets."""
 
+from functools import partial
+
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -33,6 +35,27 @@ class Forger:
         leaning = mavlink.MAVLink_attitude_message(now_ns // MS % 2**32, FORGED_ROLL, 0.0, 0.0, 0, 0, 0)
         hint = mavlink.MAVLink_set_gps_global_origin_message(self._sysid, 490_000_000, 120_000_000, 0)
         self._speaker.send(leaning, station_heartbeat(), hint, to=self._to)
+
+
+@pytest.mark.slow
+def test_of_two_copters_on_one_port_only_the_served_one_receives_gps_input() -> None:
+    port = free_port()
+    edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
+    ours, theirs, flight = AutopilotPeer(seed=1, sysid=1), AutopilotPeer(seed=2, sysid=2), LiveFlight()
+    ours.start(0, eastward, flight.clock, to=port)
+    published = live(LinkNode(10.0), edge, 1.5, flight.feed)
+    edge.on_message(m.CameraVehicle(t_ns=0, sysid=1))
+    theirs.start(0, partial(eastward, north_m=66_000.0), to=port)
+    published += live(LinkNode(10.0), edge, SECONDS, flight.feed)
+    first, second = ours.stop(), theirs.stop()
+    edge.close()
+    assert first.gps_input_received > 10 * (SECONDS - 1.0)
+    assert second.gps_input_received == 0
+    assert second.position_error_max_m is None or second.position_error_max_m < 100.0
+    assert [x.text for x in published if isinstance(x, m.StatusText) if "vehicle 2" in x.text] == [
+        "Terrafix: vehicle 2 on our port gets nothing"
+    ]
+    assert "Terrafix: vehicle 2 on our port gets nothing" in first.status_texts
 
 
 @pytest.mark.slow

@@ -185,7 +185,7 @@ def test_another_vehicle_is_served_after_a_silence(
         found.append(len(theirs.received("GPS_INPUT")))
     assert found == positions
     change = ["Terrafix: vehicle 9 is served, 7 is not"] if positions[1] else []
-    assert [text for text in port.texts() if "served" in text] == change
+    assert port.texts() == ["Terrafix: no fix: camera on vehicle 7, 9?", *change]
 
 
 @pytest.mark.parametrize(("first", "other", "changes"), [("heartbeats", "all", True), ("all", "all", False)])
