@@ -241,10 +241,7 @@ class Propagation:
         cov = tangent_to_world(state.last.cov, predicted.before.pose.rotation().matrix())
         cov[WORLD_POSITION, WORLD_POSITION] += predicted.cov[DELTA_P, DELTA_P]
         placed = start_at(state, predicted.frame, p[:2], worst_sigma(cov[:2, :2]))
-        below_m, reported_m = (
-            state.terrain.height_above_m(p),
-            reported_agl_m(state, registered.predicted.frame.attitude, p),
-        )
+        below_m, reported_m = state.terrain.height_above_m(p), reported_agl_m(state, predicted.frame.attitude, p)
         detail = f"height {below_m:.0f} m, where {reported_m:.0f} m are reported"
         verdicts = [*verdicts, _reset_verdict(ResetReason.TOO_LOW, detail)]
         return _result(predicted, placed, registered.step, verdicts)

@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from origins import origin_of
 from terrafix import messages as m
 from terrafix.core.config import Config, Map, Source
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
@@ -45,17 +46,8 @@ class Invented:
         _, lat_deg, lon_deg = PLACES[self.number % len(PLACES)]
         _, width, fx = CAMERAS[self.number // 3 % len(CAMERAS)]
         camera = m.Camera(width=width, height=width * 3 // 4, fx=fx, fy=fx, cx=width / 2, cy=width * 3 / 8)
-        return m.Origin(
-            t_ns=1_000_000 * (self.number + 1),
-            camera=camera,
-            lat_deg=lat_deg,
-            lon_deg=lon_deg,
-            ground_amsl_m=500.0,
-            start_sigma_m=10.0,
-            yaw_sigma_deg=3.0,
-            agl_sigma_m=3.0,
-            attitude_sigma_deg=2.0,
-        )
+        at_place = origin_of(camera, lat_deg=lat_deg, lon_deg=lon_deg)
+        return msgspec.structs.replace(at_place, t_ns=1_000_000 * (self.number + 1))
 
     @property
     def header(self) -> dict[str, str]:

@@ -11,9 +11,10 @@ from rich.console import Console
 
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
 
-from terrafix.core.errors import LinkError
+from terrafix.core.errors import LinkError, UsageError
 from terrafix_tools.sim.sitl import stages as sitl_stages
 from terrafix_tools.sim.sitl.firmware import Home
+from terrafix_tools.sim.sitl.fly import Disturbance
 from terrafix_tools.sim.sitl.observer import FlightLog, StatusTextRecord, Truth
 from terrafix_tools.sim.sitl.stages import FlightAborted, Stages
 
@@ -213,6 +214,19 @@ def test_a_spoof_ends_with_the_position_source_from_before_it(restored: bool, mo
     else:
         with pytest.raises(FlightAborted, match="no restored position source"):
             stages.spoof_and_kill()
+
+
+@pytest.mark.parametrize("text", ["kill", "spoof", "camera:20"])
+def test_a_disturbance_is_given_by_its_name_and_a_duration_of_the_camera(text: str) -> None:
+    found = Disturbance.parsed(text)
+    expected = ("camera", 20.0) if ":" in text else (text, 0.0)
+    assert (found.what.value, found.duration_s) == expected
+
+
+@pytest.mark.parametrize("text", ["", "fall", "camera", "camera:0", "camera:121", "camera:x", "camera:nan", "kill:5"])
+def test_another_disturbance_is_rejected_with_what_may_be_given(text: str) -> None:
+    with pytest.raises(UsageError, match=r"give kill, spoof, or camera:SECONDS \(up to 120\)"):
+        Disturbance.parsed(text)
 
 
 def test_the_vehicle_has_landed_when_it_disarms() -> None:

@@ -46,7 +46,7 @@ _EVENTS = {  # AP_Logger.h LogEvent
     25: "set home",
     28: "not landed",
 }
-_ARMED, _DISARMED = 10, 11
+ARMED, DISARMED = 10, 11
 _SUBSYSTEMS = {  # AP_Logger.h LogErrorSubsystem
     2: "radio",
     3: "compass",
@@ -336,7 +336,7 @@ def _events(found: dict[str, Table], firmware: str) -> list[Event]:
         events.append(Event(float(t_s), "mode", mode_name(firmware, int(number))))
     noted = found.get("EV", _EMPTY)
     for t_s, number in zip(noted.t_s, noted.integers("Id"), strict=True):
-        kind = "arming" if number in (_ARMED, _DISARMED) else "event"
+        kind = "arming" if number in (ARMED, DISARMED) else "event"
         events.append(Event(float(t_s), kind, _EVENTS.get(number, f"event {number}")))
     errors = found.get("ERR", _EMPTY)
     for t_s, system, code in zip(errors.t_s, errors.integers("Subsys"), errors.integers("ECode"), strict=True):

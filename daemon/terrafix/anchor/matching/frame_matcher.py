@@ -112,15 +112,19 @@ class CorrelationResult:
     def best_at(self, e_m: float, n_m: float) -> tuple[Hypothesis, float]:
         """Hypothesis with the highest standardised correlation within two cells of a camera position, and that
         correlation."""
-        scores = [s.at(e_m, n_m, 2.0 * self.cell_m) for s in self.surfaces]
-        best = int(np.argmax(scores))
-        return self.hypotheses[best], scores[best]
+        best, (score, _, _) = self._peak_at(e_m, n_m)
+        return self.hypotheses[best], score
 
     def is_mapped_at(self, e_m: float, n_m: float) -> bool:
         """Whether a feature is mapped where ``best_at`` finds the highest correlation."""
-        peaks = [(s, s.best(e_m, n_m, 2.0 * self.cell_m)) for s in self.surfaces]
-        surface, (_, there_e_m, there_n_m) = max(peaks, key=lambda peak: peak[1][0])
-        return surface.is_mapped(there_e_m, there_n_m)
+        best, (_, there_e_m, there_n_m) = self._peak_at(e_m, n_m)
+        return self.surfaces[best].is_mapped(there_e_m, there_n_m)
+
+    def _peak_at(self, e_m: float, n_m: float) -> tuple[int, tuple[float, float, float]]:
+        """Index of the surface with the highest correlation within two cells, and this with its east and north."""
+        peaks = [s.best(e_m, n_m, 2.0 * self.cell_m) for s in self.surfaces]
+        best = int(np.argmax([score for score, _, _ in peaks]))
+        return best, peaks[best]
 
     def best_hypotheses(self, count: int) -> tuple[Hypothesis, ...]:
         """The ``count`` hypotheses with the highest standardised correlation anywhere, in their order."""

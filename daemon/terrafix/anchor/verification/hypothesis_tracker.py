@@ -27,9 +27,8 @@ MERGE_RADIUS = 0.2
 # standard deviations above the null model at which right and wrong places are equally frequent
 # [measured: docs/search.md]
 NULL_SIGMAS = 1.7
-TRACK_LLR_SLOPE = (
-    2.5  # nats per standard deviation beyond that: decay of the tail of wrong places [measured: docs/search.md]
-)
+# nats per standard deviation beyond that: decay of the tail of wrong places [measured: docs/search.md]
+TRACK_LLR_SLOPE = 2.5
 # Bounds of one frame's evidence, nats. At a quarter of the right places the patches are no better than the null model,
 # because much has changed or leans, and this persists from frame to frame. The upper bound limits repetitive ground:
 # one wrong place of about 200 searches came to 21, no other to more than 18. [measured: docs/search.md]

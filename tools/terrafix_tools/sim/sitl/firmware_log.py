@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafix.link.gnss.source_switch import AUTO_SWITCH, PRIMARY
 from terrafix.link.integrity.output_predictor import distance_m
+from terrafix_tools.autopilot_log.ardupilot import ARMED, DISARMED
 from terrafix_tools.autopilot_log.dataflash import Table, read_dataflash
+from terrafix_tools.score import longest_gap_s
+from terrafix_tools.sim.sitl.report import FIX_3D
 
-FIX_3D = 3
-ARMED, DISARMED = 10, 11  # EV.Id (AP_Logger.h, LogEvent)
-POSITION_SOURCE = ("GPS_AUTO_SWITCH", "GPS_PRIMARY")  # what `link.gnss = "act"` sets
+POSITION_SOURCE = (AUTO_SWITCH, PRIMARY)  # what `link.gnss = "act"` sets
 
 
 @dataclass(frozen=True)
@@ -101,10 +103,9 @@ def _position_errors_m(positions: Table | None, truth: Table | None) -> np.ndarr
 
 def _receiver(table: Table) -> Receiver:
     fixed = table.column("Status") >= FIX_3D
-    with_fix_s = np.concatenate([table.t_s[:1], table.t_s[fixed], table.t_s[-1:]])
     return Receiver(
         fix_share=float(fixed.mean()),
-        longest_gap_s=float(np.diff(with_fix_s).max()),
+        longest_gap_s=longest_gap_s(table.t_s[fixed].tolist(), float(table.t_s[0]), float(table.t_s[-1])),
         used_share=float((table.column("U") == 1.0).mean()),
     )
 

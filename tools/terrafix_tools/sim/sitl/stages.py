@@ -150,11 +150,8 @@ class Stages:
 
     def lose_gnss(self) -> None:
         """Disables the GNSS when the vehicle is high enough and Terrafix has had a 3D fix for a while."""
-        self._wait(f"{SAFE_M:.0f} m above home and 3D fix of Terrafix", TAKE_OVER_S, self._ready_for_gnss_loss)
-        for name, value in GNSS_OFF:
-            with contextlib.suppress(LinkError):  # parameter of another firmware version
-                self._station.set_parameter(name, value)
-                break
+        self._wait_until_ready()
+        self._set_first_known(*GNSS_OFF)
         self._wait("loss of the GNSS", LOSS_S, lambda: self._fix(0) < FIX_3D)
         # Time of the first report without a fix; on a busy machine several may have arrived before this check.
         without = takewhile(lambda report: report[1] < FIX_3D, reversed(self._observer.log.fix_types[0]))
@@ -176,19 +173,25 @@ class Stages:
         """Shifts the receiver until the autopilot has been switched to GPS_INPUT, then kills Terrafix, ends the shift
         and restarts it: the switch must be undone.
         """
-        self._wait(f"{SAFE_M:.0f} m above home and 3D fix of Terrafix", TAKE_OVER_S, self._ready_for_gnss_loss)
+        self._wait_until_ready()
         before = self._position_source()
-        self._set_first_known(GLITCH, SPOOF_DEG)
+        self._set_first_known(*((name, SPOOF_DEG) for name in GLITCH))
         self._print("receiver spoofed")
         self._wait("switch to GPS_INPUT", SWITCH_S, lambda: self._position_source() != before)
         self._print(f"switched: {self._position_source()}")
         self._pause(SPOOFED_S)
         self._daemon.kill()
         self._pause(DOWN_S)
-        self._set_first_known(GLITCH, 0.0)
+        self._set_first_known(*((name, 0.0) for name in GLITCH))
         self._daemon.start()
         self._wait("restored position source", SWITCH_S, lambda: self._position_source() == before)
         self._print(f"restored: {self._position_source()}")
+
+    def land(self, limit_s: float) -> None:
+        """Waits for the rest of the mission; the vehicle disarms itself after landing."""
+        self._wait("landing", limit_s, lambda: not self._observer.log.armed[-1][1])
+        self.times = replace(self.times, landed_ns=time.monotonic_ns())
+        self._print("landed")
 
     def _interrupt(
         self, began: str, end: str, duration_s: float, begin: Callable[[], None], undo: Callable[[], None]
@@ -200,42 +203,38 @@ class Stages:
         self._pause(duration_s)
         undo()
         gap, before = Interruption(began_ns, time.monotonic_ns()), self.times.interruptions
-        self.times = replace(self.times, interruptions=(*before, gap))
         fixes, flags = self._observer.log.fix_types[GPS_ID], self._observer.log.ekf_flags
 
-        def recovered_ns() -> int | None:
-            return next((t_ns for t_ns, fix in fixes if t_ns > gap.ended_ns and fix >= FIX_3D), None)
+        def found() -> Interruption:
+            """``gap`` with what the observer has received until now."""
+            fix_ns = next((t_ns for t_ns, fix in fixes if t_ns > gap.ended_ns and fix >= FIX_3D), None)
+            if fix_ns is None:
+                return gap
+            used = (t_ns for t_ns, now in flags if t_ns >= fix_ns and now & mavlink.EKF_POS_HORIZ_ABS)
+            return replace(gap, recovered_ns=fix_ns, used_ns=next(used, None))
 
-        def used_ns() -> int | None:
-            first_ns = recovered_ns() or gap.ended_ns
-            return next((t_ns for t_ns, now in flags if t_ns >= first_ns and now & mavlink.EKF_POS_HORIZ_ABS), None)
+        def is_used() -> bool:
+            self.times = replace(self.times, interruptions=(*before, found()))
+            return self.times.interruptions[-1].used_ns is not None
 
-        self._wait(f"3D fix after the {end}", BACK_S, lambda: recovered_ns() is not None)
-        self.times = replace(self.times, interruptions=(*before, replace(gap, recovered_ns=recovered_ns())))
-        back_s = ((recovered_ns() or 0) - gap.ended_ns) / 1e9
-        self._wait(f"position of the EKF after the {end}", BACK_S, lambda: used_ns() is not None)
-        whole = replace(gap, recovered_ns=recovered_ns(), used_ns=used_ns())
-        self.times = replace(self.times, interruptions=(*before, whole))
-        self._print(
-            f"3D fix {back_s:.2f} s after the {end}, used {((used_ns() or 0) - gap.ended_ns) / 1e9:.2f} s after it"
-        )
+        self._wait(f"3D fix after the {end}", BACK_S, lambda: is_used() or found().recovered_ns is not None)
+        self._wait(f"position of the EKF after the {end}", BACK_S, is_used)
+        back_s, used_s = ((t_ns or 0) - gap.ended_ns for t_ns in (found().recovered_ns, found().used_ns))
+        self._print(f"3D fix {back_s / 1e9:.2f} s after the {end}, used {used_s / 1e9:.2f} s after it")
+
+    def _wait_until_ready(self) -> None:
+        what = f"{SAFE_M:.0f} m above home and 3D fix of Terrafix"
+        self._wait(what, TAKE_OVER_S, self._ready_for_gnss_loss)
 
     def _position_source(self) -> dict[str, int]:
         return {name: self._station.parameter(name) for name in POSITION_SOURCE}
 
-    def _set_first_known(self, names: tuple[str, ...], value: float) -> None:
-        """Sets the parameter that the firmware has, of ``names`` that it had in its versions. Raises FlightAborted."""
-        for name in names:
+    def _set_first_known(self, *choices: tuple[str, float]) -> None:
+        """Sets the first of these parameters that the firmware has: their names changed with its versions."""
+        for name, value in choices:
             with contextlib.suppress(LinkError):
                 self._station.set_parameter(name, value)
                 return
-        raise FlightAborted(f"the firmware has none of {', '.join(names)}")
-
-    def land(self, limit_s: float) -> None:
-        """Waits for the rest of the mission; the vehicle disarms itself after landing."""
-        self._wait("landing", limit_s, lambda: not self._observer.log.armed[-1][1])
-        self.times = replace(self.times, landed_ns=time.monotonic_ns())
-        self._print("landed")
 
     def _has_position(self) -> bool:
         flags = self._observer.log.ekf_flags
