@@ -12,7 +12,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "licences.md"
-NOT_SHIPPED = ("dev", "nightly")  # extras that only the checks use
+NOT_SHIPPED = ("dev", "docs", "nightly")  # extras of the checks and of the documentation
 ALLOWED = {
     "0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "ISC", "MIT", "MIT-0", "MIT-CMU",
     "PSF-2.0", "Python-2.0", "Unlicense", "Zlib",
