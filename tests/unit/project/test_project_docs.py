@@ -104,11 +104,11 @@ def test_the_site_is_built_and_a_broken_link_or_anchor_fails(tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site" / "architecture.html").read_text(encoding="utf-8")
     assert 'href="link.html' in page and (tmp_path / "site" / "repository" / "CONTRIBUTING.html").is_file()
-    text = (tmp_path / "docs" / "link.md").read_text(encoding="utf-8")
-    for broken in ("[x](nothing.md)", "[x](autopilot.md#nothing)", "[x](../nothing.toml)"):
-        (tmp_path / "docs" / "link.md").write_text(f"{text}\n{broken}\n", encoding="utf-8")
-        done = built(tmp_path)
-        assert done.returncode == 1 and "nothing" in done.stderr, broken
+    with (tmp_path / "docs" / "link.md").open("a", encoding="utf-8") as file:
+        file.write("\n[x](nothing.md) [x](autopilot.md#nothing) [x](../nothing.toml)\n")
+    done = built(tmp_path)
+    assert done.returncode == 1
+    assert all(broken in done.stderr for broken in ("'nothing.md'", "#nothing", "nothing.toml"))
 
 
 def test_the_glossary_is_linked_from_both_front_pages() -> None:
@@ -148,9 +148,9 @@ def test_source_files_named_in_the_documentation_exist(page: Path) -> None:
 def test_files_and_modules_named_in_the_documentation_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for name in re.findall(r"`((?:config|scripts|systemd|tests|daemon|engines|tools|docs)/[\w./-]*)`", text):
-        assert (ROOT / name).exists() or "NAME" in name or "AREA" in name, f"{page.name} names {name}"
+        assert (ROOT / name).exists() or re.search("AREA|NAME|NNN", name), f"{page.name} names {name}"
     for module, then in re.findall(r"python -m (terrafix[\w.]+)([^\n]*\n?[^\n]*)", text):
-        if "as of commit" not in then:  # the decision names the revision in which it runs
+        if "as of commit" not in then and "NAME" not in module:  # the decision names the revision in which it runs
             path = module.replace(".", "/")
             places = [ROOT / folder / path for folder in ("daemon", "engines", "tools")]
             assert any(one.with_suffix(".py").is_file() or (one / "__main__.py").is_file() for one in places), (
