@@ -41,9 +41,9 @@ def on_files(files: Any, config: Any) -> Any:
     pages = [*DOCS.rglob("*.md"), *ROOT.glob("*.md")]
     found = {target(page, link) for page in pages for link, _ in LINK.findall(page.read_text(encoding="utf-8"))}
     for path in sorted({*found, *(page.relative_to(ROOT) for page in ROOT.glob("*.md"))} - {None}):
-        for file in [path] if (ROOT / path).is_file() else [one.relative_to(ROOT) for one in (ROOT / path).iterdir()]:
-            if (ROOT / file).is_file():
-                files.append(File.generated(config, f"repository/{file}", abs_src_path=str(ROOT / file)))
+        for file in (ROOT / path).iterdir() if (ROOT / path).is_dir() else [ROOT / path]:
+            if file.is_file():
+                files.append(File.generated(config, f"repository/{file.relative_to(ROOT)}", abs_src_path=str(file)))
     return files
 
 
@@ -54,8 +54,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
     def moved(link: re.Match[str]) -> str:
         path = (source.parent / link[1]).resolve()
-        if re.match(r"\w+:", link[1]) or not path.is_relative_to(ROOT):
-            return link[0]
+        if re.match(r"\w+:", link[1]) or not path.is_relative_to(ROOT) or not path.exists():
+            return link[0]  # mkdocs reports what does not exist
         if path.is_relative_to(DOCS):
             return f"]({up}{path.relative_to(DOCS)}{link[2] or ''})" if not source.is_relative_to(DOCS) else link[0]
         path = path.relative_to(ROOT)
