@@ -149,7 +149,7 @@ def test_files_and_modules_named_in_the_documentation_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for name in re.findall(r"`((?:config|scripts|systemd|tests|daemon|engines|tools|docs)/[\w./-]*)`", text):
         assert (ROOT / name).exists() or re.search("AREA|NAME|NNN", name), f"{page.name} names {name}"
-    for module, then in re.findall(r"python -m (terrafix[\w.]+)([^\n]*\n?[^\n]*)", text):
+    for module, then in re.findall(r"python -m (terrafix[\w.]+)(.{0,100})", " ".join(text.split())):
         if "as of commit" not in then and "NAME" not in module:  # the decision names the revision in which it runs
             path = module.replace(".", "/")
             places = [ROOT / folder / path for folder in ("daemon", "engines", "tools")]
@@ -167,11 +167,14 @@ def unknown_commands(text: str) -> list[str]:
     ):
         command: Any = program
         for word in words.split():
-            if hasattr(command, "commands"):  # a group
-                if word not in command.commands:
-                    unknown.append(f"terrafix {words}")
-                    break
-                command = command.commands[word]
+            if not hasattr(command, "get_command"):  # no group: the word is an argument
+                break
+            command = command.get_command(typer.Context(command), word)
+            if command is None:
+                unknown.append(f"terrafix {words}")
+                break
+        if command is None:
+            continue
         options = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
         for option in re.findall(r"(?<!\S)--[a-z][a-z0-9-]*", rest):
             if option not in options:
