@@ -16,7 +16,7 @@ OURS, FLOOR, PEER, PALE = "#5b9bd9", "#1d5288", "#c9853c", "#ecd3b8"
 
 HEAD = """# Benchmark
 
-Written by `terrafix bench --page docs/benchmark.md` from one run. Its [JSON](outputs.md#benchjson) has more. Do not edit.
+Written by `terrafix bench --page docs/benchmark.md` from one run. Its [JSON](outputs.md#benchjson) has more.
 
 {cpu}, {cores} cores, load {load} before and after: compare processor times, and those of one run. All are of one
 frame in milliseconds, without the first frame: median/95 %/99 %.
@@ -30,8 +30,8 @@ around it and fits a homography by RANSAC. It begins at the position that our es
 filter or covariance of its own. *Points kept*: without the time for the points of the map."""
 STAGES = """## Stages and their floor
 
-The floor of a stage is the processor time inside of the functions of OpenCV that it calls, measured in another replay of
-the same run; the ratio is that of the sums over all frames. Estimator and smoother (iSAM2) have no such floor. Decoding
+The floor of a stage is the processor time inside of OpenCV functions that it calls, in another replay of the same
+run; the ratio is that of the sums over all frames. Estimator and smoother (iSAM2) have no such floor. Decoding
 is measured by the clock alone."""
 
 Table = list[list[str]]  # the first row is the head
