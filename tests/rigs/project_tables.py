@@ -6,15 +6,9 @@ from pathlib import Path
 import msgspec
 
 from terrafix import messages
-from terrafix.processes import ALL_MESSAGES, PROCESSES, SUPERVISOR
+from terrafix.processes import ALL_MESSAGES, PROCESSES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "architecture.md"
-# Published by the shell and the supervisor, which are not processes of the table.
-OTHER_PUBLISHERS = {
-    "ProcessEvent": f"the {SUPERVISOR}",
-    "Dropped": "the shell of every process",
-    "LogLine": f"the shell of every process, the {SUPERVISOR}",
-}
 
 
 def process_table() -> str:
@@ -31,13 +25,8 @@ def process_table() -> str:
 
 
 def message_table() -> str:
-    rows = ["| message | published by | subscribed by | contents |", "|---|---|---|---|"]
-    for message in ALL_MESSAGES:
-        publishers = [p.name for p in PROCESSES if message in p.publishes]
-        publishers += [OTHER_PUBLISHERS[message.__name__]] if message.__name__ in OTHER_PUBLISHERS else []
-        subscribers = [p.name for p in PROCESSES if message in p.subscribes and p.subscribes != ALL_MESSAGES]
-        columns = message.__name__, ", ".join(publishers), ", ".join(subscribers) or "-", _purpose(message)
-        rows.append(f"| {' | '.join(columns)} |")
+    rows = ["| message | contents |", "|---|---|"]
+    rows += [f"| {message.__name__} | {_purpose(message)} |" for message in ALL_MESSAGES]
     return "\n".join(rows)
 
 
