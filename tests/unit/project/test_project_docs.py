@@ -131,6 +131,17 @@ def test_files_named_on_the_architecture_page_exist() -> None:
         assert any((ROOT / folder / name).is_file() for folder in ("daemon/terrafix", "engines", "tools")), name
 
 
+def test_functions_named_beside_files_on_the_architecture_page_exist() -> None:
+    text = project_tables.PAGE.read_text(encoding="utf-8")
+    pairs = re.findall(r"`((?:\w+/)+\w+\.py)`: `(\w+)`(?: \([^)]*\))?(?:, `(\w+)`)?", text)
+    assert len(pairs) >= 15
+    for name, *functions in pairs:
+        file = next(ROOT / folder / name for folder in ("daemon/terrafix", "tools") if (ROOT / folder / name).is_file())
+        code = file.read_text(encoding="utf-8")
+        for function in filter(None, functions):
+            assert re.search(rf"^ *(?:def|class) {function}\b", code, flags=re.M), f"{name} has no {function}"
+
+
 NOT_OURS = {"validate_gpkg.py", "test_NAME.py"}  # of GDAL; a placeholder
 
 
