@@ -1,9 +1,7 @@
-"""Generates the two tables of docs/architecture.md from the code. Run this file to write them into the page."""
+"""Generates the table of docs/architecture.md from the code. Run this file to write it into the page."""
 
 import re
 from pathlib import Path
-
-import msgspec
 
 from terrafix import messages
 from terrafix.processes import ALL_MESSAGES, PROCESSES
@@ -24,30 +22,20 @@ def process_table() -> str:
     return "\n".join(rows)
 
 
-def message_table() -> str:
-    rows = ["| message | contents |", "|---|---|"]
-    rows += [f"| {message.__name__} | {_purpose(message)} |" for message in ALL_MESSAGES]
-    return "\n".join(rows)
-
-
 def page(text: str) -> str:
-    """The text of the page with both tables generated from the code."""
-    for name, table in (("processes", process_table()), ("messages", message_table())):
-        text, count = re.subn(
-            rf"(<!-- table: {name} -->).*?(<!-- end -->)", lambda m, t=table: f"{m[1]}\n{t}\n{m[2]}", text, flags=re.S
-        )
-        assert count == 1, f"{PAGE}: the marks of the table '{name}' are missing"
+    """The text of the page with the table generated from the code."""
+    text, count = re.subn(
+        r"(<!-- table: processes -->).*?(<!-- end -->)",
+        lambda m: f"{m[1]}\n{process_table()}\n{m[2]}",
+        text,
+        flags=re.S,
+    )
+    assert count == 1, f"{PAGE}: the marks of the table are missing"
     return text
 
 
 def _names(of: tuple[type[messages.Message], ...]) -> str:
     return ", ".join(message.__name__ for message in of) or "-"
-
-
-def _purpose(message: type[msgspec.Struct]) -> str:
-    """-> first paragraph of the docstring, without requirement ids."""
-    first = " ".join((message.__doc__ or "").strip().split("\n\n")[0].split())
-    return re.sub(r" \([A-Z]{2}-\d+[^)]*\)", "", first).replace("``", "`")
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ def test_the_architecture_page_is_short() -> None:
     assert len(project_tables.PAGE.read_text(encoding="utf-8").splitlines()) <= 200
 
 
-def test_the_architecture_page_has_the_generated_tables() -> None:
+def test_the_architecture_page_has_the_generated_table() -> None:
     text = project_tables.PAGE.read_text(encoding="utf-8")
     assert text == project_tables.page(text), "run: .venv/bin/python tests/rigs/project_tables.py"
 
