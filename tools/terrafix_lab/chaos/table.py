@@ -32,13 +32,15 @@ def line(outcome: Outcome) -> str:
 
 
 def cell(outcome: Outcome | None) -> str:
-    """Silence, and time without a fix, in seconds; a broken promise in words."""
+    """Silence/time to a fix, in seconds; a broken promise in words; empty: no effect."""
     if outcome is None or outcome.verdict == NO_FIX:
         return "-"
     if outcome.silence_s is None:
         return outcome.verdict
+    if is_without_effect(outcome):
+        return ""
     back = "-" if outcome.back_s is None else f"{outcome.back_s:.1f}"
-    figures = f"{outcome.silence_s:.1f}, {back}"
+    figures = f"{outcome.silence_s:.1f}/{back}"
     return figures if outcome.verdict == "ok" else f"{figures} **{outcome.verdict}**"
 
 
@@ -63,7 +65,9 @@ def table(outcomes: Sequence[Outcome]) -> str:
         elif len(of) == len(phases) and all(is_without_effect(o) for o in of.values()):
             quiet.append(fault.name)
         else:
-            rows.append(f"| {fault.name} | {' | '.join(cell(of.get(phase)) for phase in phases)} |")
+            rows.append(
+                f"| {fault.name} |" + "".join(f" {cell(of.get(phase))} |" for phase in phases).replace("  ", " ")
+            )
     notes = [
         f"{what}: {_grouped(names)}." for what, names in (("Without effect", quiet), ("Not flown", missing)) if names
     ]
