@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Record
 from terrafix_tools.score import COVERAGE_FLOORS, INSIDE, coverage, is_false_fix, late_from_s, nees_band, nees_of
 
@@ -134,7 +134,7 @@ class FlightResult:
     def drift(self) -> float | None:
         """Error since the last map fix over the path since then; None for a flight with a map or a short path."""
         fixed = np.flatnonzero(self.record.anchor_age_ms == 0)
-        if self.record.plan.fault is not Fault.DRIFT or not len(fixed):
+        if self.record.plan.fault is not DrawnFault.DRIFT or not len(fixed):
             return None
         path_m = float(self.record.path_m[-1] - self.record.path_m[fixed[-1]])
         grown = self.record.error_m[-1, :2] - self.record.error_m[fixed[-1], :2]

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from terrafix_lab.accept.measuring.evidence import Evidence, FrameEvidence
-from terrafix_lab.accept.measuring.results import Measured, Span, Verdict
+from terrafix_lab.accept.measuring.results import Measured, Verdict
+from terrafix_lab.faults.edits import Span
 from terrafix_tools.score import FALSE_FIX_ERROR_M, late_from_s
 
 RECOVERED_M, RECOVERED_FRAMES = 20.0, 3  # recovered: below this error and not false, for this many consecutive frames

@@ -103,7 +103,9 @@ LYING_IN_THE_LOOP = (
     "aside on a fix", "aside at withdrawal", "late lies sent", "lies sent", "fix again", "recovery",
     "late false fixes", "false fixes in all", "right at the end", "claims", "vehicle error", "failsafes",
 )  # fmt: skip
+WITH_SPAN = ("claims", "coverage", "false fixes", "both estimates", "within 50 m outside", "says so", "found again")
 EVERYWHERE = ("within 50 m", "within 20 m", "not localised", "both estimates", "claims", "coverage", "false fixes")
+SCARCE = (*EVERYWHERE, "claim width")
 
 
 def judge(scenario: str, names: tuple[str, ...], evidence: Evidence) -> list[JudgedRow]:
