@@ -227,9 +227,9 @@ def sent(name: str) -> list[tuple[bytes, int]]:
 
 
 def test_a_campaign_that_lacks_what_a_fault_needs_says_so_and_names_one_that_has_it() -> None:
-    with pytest.raises(UsageError, match="'disk: full': the fault needs .* fly it by terrafix chaos --fault$"):
+    with pytest.raises(UsageError, match=r"'disk: full': the fault needs .* fly it by terrafix chaos --fault$"):
         check_flown_by("terrafix montecarlo --fault", FAULTS["disk: full"])
-    with pytest.raises(UsageError, match="needs images, .* terrafix accept --scenario or terrafix chaos --fault$"):
+    with pytest.raises(UsageError, match=r"needs images, .* terrafix accept --scenario or terrafix chaos --fault$"):
         check_flown_by("terrafix montecarlo --fault", FAULTS["half the picture stands still"])
     for fault in FAULTS.values():
         able = [command for command in CAMPAIGNS if not lacking(command, fault)]

@@ -33,7 +33,7 @@ class StreamedCamera:
 
         Images exist at multiples of 1 / ``frame_hz``: each is sent at its own time, and stamped with it."""
         self.edit: Edit = unchanged
-        self.pushed = 0
+        self.pushed_s: list[float] = []  # monotonic time of each image
         self._stream, self._image_at, self._flight_s = stream, image_at, flight_s
         self._frame_hz, self._wait_s = frame_hz, 0.0
         self._stopping = threading.Event()
@@ -57,7 +57,7 @@ class StreamedCamera:
                     self._stopping.wait(REPEATED_AFTER / self._frame_hz)
                 before_ns = shot.frame.t_ns
                 self._stream.push_jpeg(jpegs.of(shot), shot.frame.t_ns)
-                self.pushed += 1
+                self.pushed_s.append(time.monotonic())
 
     def _shots(self, edit: Edit, jpegs: "_Jpegs") -> Iterator[Shot]:
         """Each when its time has come, until there is another edit."""

@@ -1,7 +1,6 @@
 """Flies the cells of the fault matrix, one after the other."""
 
 import fcntl
-import math
 import os
 import shutil
 import subprocess
@@ -19,9 +18,10 @@ from terrafix_lab.chaos import verdict as judge
 from terrafix_lab.chaos.rig import NONE, Rig
 from terrafix_lab.chaos.scene import LEAD_S, Scene
 from terrafix_lab.chaos.verdict import Outcome
-from terrafix_lab.faults.edits import EVER, unchanged, unchanged_origin
+from terrafix_lab.faults.edits import EVER, Span, unchanged, unchanged_origin
 from terrafix_lab.faults.fault import ROOT, Fault, Need, Phase, Process
 from terrafix_lab.faults.pictures import black
+from terrafix_lab.track import measured
 from terrafix_tools.score import longest_gap_s
 
 DISK_MB = 24  # of a disk of its own
@@ -92,10 +92,11 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
     before = rig.peer.fixes()
     fault_s = time.monotonic()
     process = fault.process or Process()
-    if fault.source is not None:
-        rig.edit_inputs(fault.edit(fault.span(fault_s, math.inf, fault_s)))
-    process.begin(rig)
     lasts_s = WHOLE_S if fault.lasts_s is None else fault.lasts_s
+    span = Span(fault_s, fault_s + lasts_s, fault.name)
+    if fault.source is not None:
+        rig.edit_inputs(fault.edit(span))
+    process.begin(rig)
     _wait(rig, fault_s + lasts_s, lambda: process.during(rig, time.monotonic() - fault_s))
     rig.edit_inputs(unchanged)
     process.end(rig)
@@ -116,6 +117,7 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
         silence_s=longest_gap_s(rig.peer.received_s, fault_s, end_s),
         without_fix_s=judge.without_fix_s(times, fault_s, end_s),
         back_s=judge.back_s(times, ended_s, end_s),
+        criteria=measured(judge.track_of(fixes, span, rig.camera.pushed_s)),
         load=os.getloadavg()[0] / (os.cpu_count() or 1),
     )
 

@@ -22,6 +22,7 @@ def line(outcome: Outcome) -> str:
         "not recorded": _s(outcome.not_recorded_s),
         "stop": _s(outcome.stop_s),
     }
+    figures |= {name: "-" if value is None else f"{value:g}" for name, value in outcome.criteria.items()}
     shown = ", ".join(f"{name} {value}" for name, value in figures.items())
     return f"{outcome.fault:28} {outcome.phase:21} {shown}: {outcome.verdict}"
 
@@ -37,8 +38,8 @@ def cell(outcome: Outcome | None) -> str:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Faults by phases (those of MATRIX, others if flown; phases of which there is any outcome), and a line that sums all
-    cells up."""
+    """Faults by phases (those of MATRIX, others if flown; phases of which there is any outcome), and a line that sums
+    all cells up."""
     found = {(o.fault, o.phase): o for o in outcomes}
     phases = [phase for phase in Phase if any(o.phase == phase for o in outcomes)]
     rows = [f"| fault | {' | '.join(phases)} |", f"|---|{'---|' * len(phases)}"]

@@ -32,7 +32,7 @@ def shown(change: pictures.Change) -> Callable[[Span], Edit]:
     return lambda span: during(span, pictures.every_picture(change))
 
 
-NONE = Fault("none", lasts_s=0.0)
+NONE = Fault("none", lasts_s=0.0, is_true=True)
 CAMERA = (
     Fault("camera: unplugged", "No frame comes.", SHORT_S, edits.unplugged, is_true=True),
     Fault("camera: frozen", "One picture again and again.", SHORT_S, pictures.frozen, is_true=True),

@@ -26,7 +26,7 @@ def edited(flown: SimulatedFlight, fault: Fault) -> SimulatedFlight:
         pictures=pictures,
         telemetry=[sorted((*shot.states, *shot.imu), key=lambda message: message.t_ns) for shot in found],
         path_m=np.interp([shot.t_s for shot in frames], times_s, flown.path_m),
-        lie_from_s=None if fault.is_true else span.from_s,
+        lie=None if fault.is_true else span,
     )
     return changed if fault.origin is None else _with_origin(changed, fault)
 

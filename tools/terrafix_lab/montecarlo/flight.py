@@ -26,6 +26,7 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix.smoother.node import SmootherNode
+from terrafix_lab.faults.edits import Span
 from terrafix_lab.faults.table import FAULTS
 from terrafix_lab.montecarlo.edited import edited
 from terrafix_lab.montecarlo.fault import DrawnFault
@@ -62,7 +63,7 @@ class Record:
     smoother_cpu_s: float = 0.0
     smoothed_error_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2); nan: not refined in flight
     smoothed_cov: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))  # (N, 2, 2) as published
-    lie_from_s: float | None = None  # start of the first false input; None: there is none
+    lie: Span | None = None  # of the first false input; None: there is none
     fixes: dict[str, int] = field(default_factory=dict)  # verdicts on map matches
 
 
@@ -117,7 +118,7 @@ class Run:
             seed=plan.seed,
         )
         faults, lies = Faults(plan.fault, plan.duration_s, plan.seed), Lies(plan, flown)
-        record.lie_from_s = lies.start_s()
+        record.lie = lies.span()
         self._send(flown.origin)
         late: list[tuple[int, MapMatch]] = []  # frame at which it is published
         for i, shot in enumerate(flown.frames):

@@ -12,6 +12,7 @@ from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Imu, Message, Origin, VehicleState
+from terrafix_lab.faults.edits import Span
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.ground import Terrain
 from terrafix_lab.montecarlo.plan import FlightPlan
@@ -66,7 +67,7 @@ class SimulatedFlight:
     telemetry: list[list[Message]]  # before each frame
     path_m: np.ndarray  # (N,) flown over ground up to each frame
     terrain: Terrain  # in the estimator's local frame
-    lie_from_s: float | None = None  # beginning of a false input of the table of faults
+    lie: Span | None = None  # of a false input of the table of faults
 
     def at(self, t_s: float) -> Shot:
         """The truth at any time of the flight. Between frames: cubic Hermite position, constant angular rate."""

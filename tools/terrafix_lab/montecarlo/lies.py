@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from terrafix.messages import MapMatch, Prediction, SearchResult, SearchStep, Verdict
+from terrafix_lab.faults.edits import Span
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.faults import no_match, wrong_match
 from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight
@@ -54,19 +55,19 @@ class Lies:
         self._turn_rad = float(rng.uniform(-math.pi, math.pi))
         self._pace, self._away_m = float(rng.uniform(*FOREIGN_PACE)), _random_offset_m(rng, FOREIGN_AWAY_M)
         self._rng, self._town_m = rng, _random_offset_m(rng, TOWN_AWAY_M)
-        self._search = Search() if plan.lies or flown.lie_from_s is not None else None
+        self._search = Search() if plan.lies or flown.lie is not None else None
 
-    def start_s(self) -> float | None:
-        """Start of the first false input; None: there is none."""
+    def span(self) -> Span | None:
+        """Of the first false input, whose end is not known here if it is drawn; None: there is none."""
         if not self._lies:
-            return self._flown.lie_from_s
+            return self._flown.lie
         starts = {
             DrawnFault.FOREIGN: self._foreign_from,
             DrawnFault.FROZEN: self._frozen_from,
             DrawnFault.TOWN: self._town_from,
         }
         first = min(starts.get(lie, 0) for lie in self._lies)
-        return self._flown.frames[min(first, len(self._flown.frames) - 1)].t_s
+        return Span(self._flown.frames[min(first, len(self._flown.frames) - 1)].t_s, math.inf, "")
 
     def picture(self, i: int) -> Shot:
         """True pose of the content of frame ``i``, with its stated time."""

@@ -1,5 +1,6 @@
 """Monte Carlo flights with false inputs: times and sizes of each."""
 
+import math
 from dataclasses import replace
 
 import msgspec
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
+from terrafix_lab.faults.edits import Span
 from terrafix_lab.montecarlo import lies as of
 from terrafix_lab.montecarlo.fault import LIES, DrawnFault
 from terrafix_lab.montecarlo.flight import Record
@@ -81,7 +83,8 @@ def test_a_frozen_camera_repeats_one_pose_with_new_times() -> None:
     assert held == list(range(held[0], held[-1] + 1)) and 14 <= len(held) <= 40
     assert all(np.array_equal(shown[i].p_m, flight.frames[held[0] - 1].p_m) for i in held)
     assert [shot.t_s for shot in shown] == [shot.t_s for shot in flight.frames]
-    assert lies.start_s() == flight.frames[held[0] - 1].t_s
+    span = lies.span()
+    assert span is not None and span.from_s == flight.frames[held[0] - 1].t_s
 
 
 def test_foreign_motion_is_far_away_and_consistent_and_has_no_map_match() -> None:
@@ -107,9 +110,9 @@ def test_foreign_motion_is_far_away_and_consistent_and_has_no_map_match() -> Non
 def test_over_the_map_of_another_town_a_fifth_of_the_frames_have_wrong_matches() -> None:
     drawn, flight = flown(DrawnFault.TOWN)
     lies, off = Lies(drawn, flight), []
-    start_s = lies.start_s()
-    assert start_s is not None
-    after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= start_s]
+    span = lies.span()
+    assert span is not None
+    after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= span.from_s]
     for i in after * 20:  # enough matches to estimate a share
         match = lies.match(i, PREDICTION, always(FOUND))
         if match.pose is not None:
@@ -163,7 +166,8 @@ def judged(lie_from_s: float | None, false_at: list[int]) -> FlightResult:
         plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n),
         truth_m=np.zeros((n, 2)), error_m=error, cov=cov, velocity_error_mps=np.zeros((n, 3)),
         velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1), refined_error_m=np.zeros((n, 2)),
-        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n), memory_mb=np.zeros(n), lie_from_s=lie_from_s)  # fmt: skip
+        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n), memory_mb=np.zeros(n),
+        lie=None if lie_from_s is None else Span(lie_from_s, math.inf, ""))  # fmt: skip
     return FlightResult.of(record)
 
 
