@@ -47,7 +47,14 @@ def chaos(
         raise UsageError("no such fault or phase; 'terrafix chaos --list' names them")
     if list_only:
         typer.echo(
-            "\n".join(["phases:", *(f"  {p}" for p in Phase), "faults:", *(f"  {f.name}" for f in FAULTS.values())])
+            "\n".join(
+                [
+                    "phases:",
+                    *(f"  {p}" for p in Phase),
+                    "faults:",
+                    *(f"  {f.name:36} {f.words}".rstrip() for f in FAULTS.values()),
+                ]
+            )
         )
         return
     for chosen in faults:

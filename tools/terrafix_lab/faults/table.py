@@ -2,7 +2,8 @@
 row needs: `terrafix accept --scenario`, `terrafix montecarlo --fault`, `terrafix chaos --fault`."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
+from itertools import accumulate, pairwise
 
 from terrafix.core.errors import UsageError
 from terrafix_lab.faults import edits, pictures
@@ -30,6 +31,18 @@ def reported(change: StateEdit) -> Callable[[Span], Edit]:
 def shown(change: pictures.Change) -> Callable[[Span], Edit]:
     """In the pictures of the span."""
     return lambda span: during(span, pictures.every_picture(change))
+
+
+def in_turn(name: str, words: str, *faults: Fault) -> Fault:
+    """Faults of the source that follow each other, each as long as it lasts."""
+
+    def source(span: Span) -> Edit:
+        spans = list(accumulate((f.lasts_s or 0.0 for f in faults), initial=span.from_s))
+        edited = [f.edit(Span(a, b, f.name)) for f, (a, b) in zip(faults, pairwise(spans), strict=True)]
+        return lambda shots: reduce(lambda given, edit: edit(given), edited, shots)
+
+    needs, lasts_s = frozenset().union(*(f.needs for f in faults)), sum(f.lasts_s or 0.0 for f in faults)
+    return Fault(name, words, lasts_s, source, needs=needs, is_true=all(f.is_true for f in faults))
 
 
 NONE = Fault("none", lasts_s=0.0, is_true=True)
@@ -201,8 +214,9 @@ IMPRECISE_INPUTS = (
         "heading unknown", "No heading is reported.", source=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
     ),
 )
+SCENARIOS: tuple[Fault, ...] = ()  # of several faults
 MATRIX = (NONE, *KILLED_AND_LIMITED, *CAMERA, *AROUND_THEM)  # what `terrafix chaos` flies if no fault is named
-FAULTS = {fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS)}
+FAULTS = {fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *SCENARIOS)}
 
 
 def fault_named(name: str) -> Fault:

@@ -8,7 +8,7 @@ import pytest
 from terrafix.core.errors import UsageError
 from terrafix.messages import VehicleState, Verdict
 from terrafix_lab.faults import pictures
-from terrafix_lab.faults.table import FAULTS
+from terrafix_lab.faults.table import FAULTS, in_turn
 from terrafix_lab.montecarlo.edited import edited
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import run
@@ -70,7 +70,7 @@ def test_a_picture_turned_by_180_degrees_is_that_of_a_turned_camera_and_a_mirror
     image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
     assert np.array_equal(pictures.upside_down(image), image[::-1, ::-1])
     assert np.array_equal(pictures.mirrored(image), image[:, ::-1])
-    stretched = pictures.scaled(1.0, 2.0)(np.repeat(np.arange(0, 80, 10, np.uint8), 8).reshape(8, 8))
+    stretched = pictures.scaled(1.0, 2.0)(np.repeat(10 * np.arange(8, dtype=np.uint8), 8).reshape(8, 8))
     assert stretched[:, 0].tolist() == [18, 22, 28, 32, 38, 42, 48, 52]
 
 
@@ -87,3 +87,13 @@ def test_a_fault_that_monte_carlo_cannot_fly_is_one_clear_error() -> None:
     with pytest.raises(UsageError, match=r"'moon': no such fault; known: none, 10 % wrong"):
         fault_of("moon")
     assert fault_of("60 s blackouts") is DrawnFault.BLACKOUT and fault_of("mirrored pictures") in FLYABLE
+
+
+def test_faults_in_turn_follow_each_other() -> None:
+    both = in_turn("both", "", FAULTS["camera: unplugged"], FAULTS["frozen picture with noise"])
+    flown = edited(FLOWN, both)
+    assert both.lasts_s == 21.0 and both.flight_s == 52.5 and flown.lie is not None
+    times_s = [shot.t_s for shot in flown.frames]
+    assert not [t_s for t_s in times_s if 0.0 <= t_s - flown.lie.from_s < 6.0]
+    held = {flown.pictures[i].p_m.tobytes() for i, t_s in enumerate(times_s) if 7.0 < t_s - flown.lie.from_s < 21.0}
+    assert len(held) == 1
