@@ -156,6 +156,12 @@ FALSE_INPUTS = (
         partial(pictures.falling_behind, lag_s=FROZEN_S / 2),
     ),
     Fault(
+        "stream falls behind",
+        "For 40 s the delay of the pictures grows evenly to 2 s, then the camera is live.",
+        40.0,
+        partial(pictures.falling_behind, lag_s=2.0),
+    ),
+    Fault(
         "half the picture stands still",
         "The lower half of every picture shows a part of the vehicle, from the first frame on.",
         source=whole(pictures.partly_frozen(STILL_SHARE, SEED)),
