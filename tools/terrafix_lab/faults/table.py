@@ -162,6 +162,23 @@ FALSE_INPUTS = (
         partial(pictures.falling_behind, lag_s=2.0),
     ),
     Fault(
+        "picture squeezed in one axis",
+        "16:9 is shown as 4:3 in every picture: one axis has another scale than the description says.",
+        source=shown(pictures.scaled(1.0, 4.0 / 3.0)),
+    ),
+    Fault(
+        "camera upside down",
+        "For 20 s the pictures are turned by 180 degrees, as after a reboot of the camera.",
+        20.0,
+        shown(pictures.upside_down),
+    ),
+    Fault(
+        "foreign frames in a row",
+        "For 5 s the pictures are mirrored: they agree with each other, and are nowhere on the map.",
+        5.0,
+        shown(pictures.mirrored),
+    ),
+    Fault(
         "half the picture stands still",
         "The lower half of every picture shows a part of the vehicle, from the first frame on.",
         source=whole(pictures.partly_frozen(STILL_SHARE, SEED)),
