@@ -237,7 +237,15 @@ IMPRECISE_INPUTS = (
         "heading unknown", "No heading is reported.", source=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
     ),
 )
-SCENARIOS: tuple[Fault, ...] = ()  # of several faults
+INPUTS = {fault.name: fault for fault in (*CAMERA, *FALSE_INPUTS)}
+SCENARIOS: tuple[Fault, ...] = (  # of several faults
+    in_turn(
+        "camera reboots upside down",
+        "No frame for 6 s, then the pictures are turned by 180 degrees for 20 s.",
+        INPUTS["camera: unplugged"],
+        INPUTS["camera upside down"],
+    ),
+)
 MATRIX = (NONE, *KILLED_AND_LIMITED, *CAMERA, *AROUND_THEM)  # what `terrafix chaos` flies if no fault is named
 FAULTS = {fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *SCENARIOS)}
 
