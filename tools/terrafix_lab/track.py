@@ -72,6 +72,8 @@ CRITERIA = {
     "late sure over 20 m": Criterion(
         "positions beyond 20 m and 3 sigma, later than 3 s and 5 frames into the fault", "",
         lambda track: float(track.is_late(LATE_M).sum()), sum),
+    "right again": Criterion(
+        "from the end of the fault until within 20 m and claimed to 30 m (95 %), three in a row", "s", Track.again_s),
 }  # fmt: skip
 
 
