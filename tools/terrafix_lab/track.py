@@ -77,12 +77,12 @@ CRITERIA = {
 }  # fmt: skip
 
 
-def measured(track: Track) -> dict[str, float | None]:
-    """By name of CRITERIA."""
-    return {name: criterion.measure(track) for name, criterion in CRITERIA.items()}
-
-
-def of_flights(flights: Sequence[dict[str, float | None]]) -> dict[str, float | None]:
-    """Results of ``measured`` of several flights as one."""
-    known = {name: [value for one in flights if (value := one[name]) is not None] for name in CRITERIA}
-    return {name: CRITERIA[name].of(values) if values else None for name, values in known.items()}
+def measured(tracks: Sequence[Track]) -> dict[str, str]:
+    """Of one flight or of several together: name of CRITERIA -> value with its unit; "-": not measurable."""
+    found = {}
+    for name, row in CRITERIA.items():
+        values = [value for track in tracks if (value := row.measure(track)) is not None]
+        never = sum(map(math.isinf, values))
+        shown = f"{row.of([v for v in values if v < math.inf] or [0.0]):g} {row.unit}".strip() if values else "-"
+        found[name] = f"never in {never} of {len(values)} flights" if never else shown
+    return found

@@ -117,7 +117,7 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
         silence_s=longest_gap_s(rig.peer.received_s, fault_s, end_s),
         without_fix_s=judge.without_fix_s(times, fault_s, end_s),
         back_s=judge.back_s(times, ended_s, end_s),
-        criteria=measured(judge.track_of(fixes, span, rig.camera.pushed_s)),
+        criteria=measured([judge.track_of(fixes, span, rig.camera.pushed_s)]),
         load=os.getloadavg()[0] / (os.cpu_count() or 1),
     )
 

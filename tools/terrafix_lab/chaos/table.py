@@ -22,8 +22,7 @@ def line(outcome: Outcome) -> str:
         "not recorded": _s(outcome.not_recorded_s),
         "stop": _s(outcome.stop_s),
     }
-    figures |= {name: "-" if value is None else f"{value:g}" for name, value in outcome.criteria.items()}
-    shown = ", ".join(f"{name} {value}" for name, value in figures.items())
+    shown = ", ".join(f"{name} {value}" for name, value in {**figures, **outcome.criteria}.items())
     return f"{outcome.fault:28} {outcome.phase:21} {shown}: {outcome.verdict}"
 
 

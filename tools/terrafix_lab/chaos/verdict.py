@@ -36,7 +36,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     back_s: float | None = None  # from the end of the fault to a lasting fix; None: not back, or none before
     not_recorded_s: float | None = None  # longest time of GPS_INPUT that the record lacks
     stop_s: float | None = None  # that the ordered stop took
-    criteria: dict[str, float | None] = {}  # those of terrafix_lab/track.py
+    criteria: dict[str, str] = {}  # those of terrafix_lab/track.py
     load: float | None = None  # load average of the computer over its cores at the end
 
 

@@ -210,7 +210,7 @@ def show(result: dict[str, Any], console: Console) -> None:
         f"{result['wall_s']:.0f} s",
         highlight=False,
     )
-    criteria = (f"{name}: {'-' if value is None else f'{value:g}'}" for name, value in total["criteria"].items())
+    criteria = (f"{name}: {value}" for name, value in total["criteria"].items())
     console.print("; ".join(criteria), highlight=False)
     shares = ", ".join(f"{name.replace('_', ' and ')} {share:.2f}" for name, share in total["parts"].items())
     console.print(f"squared error over claim, 1 when true: {shares}", highlight=False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Record
-from terrafix_lab.track import Track, measured, of_flights
+from terrafix_lab.track import Track, measured
 from terrafix_tools.score import COVERAGE_FLOORS, INSIDE, coverage, nees_band, nees_of
 
 POSE95 = 12.592  # chi-square with 6 degrees of freedom, 95 %
@@ -175,7 +175,7 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
         "smoothed_median_m": float(np.median(smoothed_m)) if len(smoothed_m) else None,
         "false_fixes": sum(f.false_fixes for f in flights),
         "late_false_fixes": sum(f.late_false_fixes for f in flights),
-        "criteria": of_flights([measured(f.track) for f in flights]),
+        "criteria": measured([f.track for f in flights]),
         "notice_s": max((f.notice_s for f in flights if f.notice_s is not None), default=None),
         "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
         "coverage": coverage(nees),
