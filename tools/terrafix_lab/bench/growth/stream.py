@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from terrafix.messages import MapMatch, Odometry, Origin
+from terrafix.messages import MapMatch, Message, Odometry, Origin
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flown import SimulatedFlight, fly
 from terrafix_lab.montecarlo.ground import Terrain
