@@ -14,6 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from terrafix.core.errors import SourceError
+from terrafix.core.mavlink.tlog import TelemetryLog
 from terrafix.core.toml_file import read_toml
 from terrafix.messages import Camera, Origin
 from terrafix.vision.sources.plausible import check_camera
@@ -83,6 +84,7 @@ class TelemetryTable(_Table, frozen=True, kw_only=True):
     agl_sigma_m: Positive = AGL_SIGMA_M
     attitude_sigma_deg: Positive = ATTITUDE_SIGMA_DEG
     tlog_t0_us: int | None = None  # UNIX microseconds of t_s = 0; absent: time of the first record of the log
+    system_id: Annotated[int, Meta(ge=0, le=255)] = 0  # vehicle of the log; 0: the only one, or the only one that moves
 
 
 class Description(_Table, frozen=True, kw_only=True):
@@ -180,6 +182,11 @@ def origin_of(description: Description, camera: Camera, start: tuple[float, floa
         agl_sigma_m=description.telemetry.agl_sigma_m,
         attitude_sigma_deg=description.telemetry.attitude_sigma_deg,
     )
+
+
+def telemetry_log(path: Path, description: Description) -> TelemetryLog:
+    """The log of a flight, with the zero and the vehicle that its description states. Raises SourceError."""
+    return TelemetryLog(path, description.telemetry.tlog_t0_us, description.telemetry.system_id)
 
 
 def _check_numbers(path: Path, table: dict[str, Any], where: str = "") -> None:

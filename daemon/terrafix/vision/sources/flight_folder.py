@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from terrafix.core.errors import SourceError
-from terrafix.core.mavlink.tlog import read_imu, read_tlog
 from terrafix.messages import Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
-from terrafix.vision.sources.description import camera_of, origin_of, read_description
+from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
 from terrafix.vision.sources.images import WRONG_SIZE, downscaled_camera, read_image
 from terrafix.vision.sources.plausible import check_heights
 from terrafix.vision.sources.table import Row, read_table
@@ -32,8 +31,10 @@ class FlightFolder:
         check_heights(folder / "frames.csv", heights_m)
         self._check_files()
         self._check_size()
+        log = folder / "telemetry.tlog"
+        self._log = telemetry_log(log, self._description) if log.is_file() else None
         self._states = self._telemetry()
-        self._imu = self._inertial()
+        self._imu: list[Imu] = [] if self._log is None else self._log.imu
 
     def origin(self) -> Origin:
         return self._origin
@@ -104,19 +105,10 @@ class FlightFolder:
     def _telemetry(self) -> list[VehicleState]:
         """States of frames.csv and telemetry.tlog in time order. A tlog may start before or after the first frame."""
         states = [row.state for row in self._rows if row.state is not None]
-        log = self._log()
-        if log is not None:
-            states += read_tlog(log, self._description.telemetry.tlog_t0_us)
+        if self._log is not None:
+            states += self._log.states
             states.sort(key=lambda state: state.t_ns)
         return states
-
-    def _inertial(self) -> list[Imu]:
-        log = self._log()
-        return [] if log is None else read_imu(log, self._description.telemetry.tlog_t0_us)
-
-    def _log(self) -> Path | None:
-        log = self.folder / "telemetry.tlog"
-        return log if log.is_file() else None
 
 
 def _is_inside(file: Path, frames: Path, real_frames: Path) -> bool:
