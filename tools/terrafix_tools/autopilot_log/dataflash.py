@@ -110,8 +110,8 @@ class DataFlash:
 
 
 def is_dataflash(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a DataFlash log, binary or text. The first of them may be lost, zero
-    or foreign: a whole message FMT is enough."""
+    """Whether the first bytes of a file are those of a DataFlash log, binary or text. The first of them may be lost,
+    zero or foreign: a whole message FMT is enough."""
     return _has_binary_format(head) or _has_text_format(head)
 
 

@@ -13,8 +13,8 @@ SUFFIXES = (".bin", ".log", ".tlog", ".ulg")
 
 
 def read_autopilot_log(path: Path, system_id: int = 0) -> AutopilotLog:
-    """``system_id``: the vehicle of a telemetry log with several; 0: the only one that moves. Raises SourceError: no such
-    file, empty, no log of an autopilot, or one without attitude."""
+    """``system_id``: the vehicle of a telemetry log with several; 0: the only one that moves. Raises SourceError: no
+    such file, empty, no log of an autopilot, or one without attitude."""
     head = _head(path)
     if not head:
         raise SourceError(f"{path}: is empty; copy the log from the autopilot again")

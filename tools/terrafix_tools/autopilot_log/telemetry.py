@@ -93,7 +93,9 @@ def read_telemetry(path: Path, system_id: int = 0) -> AutopilotLog:
             if (track := _receiver(instance, found[name])) is not None
         ],
         fusion=_fusion(found["EKF_STATUS_REPORT"]),
-        events=sorted([*_states(found["HEARTBEAT"], firmware), *_texts(found["STATUSTEXT"])], key=lambda event: event.t_s),
+        events=sorted(
+            [*_states(found["HEARTBEAT"], firmware), *_texts(found["STATUSTEXT"])], key=lambda event: event.t_s
+        ),
         counts=Counter({name: len(of) for name, of in found.items() if of}),
         skipped_bytes=records.skipped_bytes,
         notes=records.notes(),

@@ -16,7 +16,9 @@ OutArgument = Annotated[Path, typer.Argument(help="Record to write (.mcap).")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 FromOption = Annotated[float, typer.Option("--from", help="Seconds since the start of the flight.")]
 ToOption = Annotated[float, typer.Option("--to", help="Seconds since the start of the flight.")]
-SystemOption = Annotated[int, typer.Option("--system", help="MAVLink system id of the vehicle, of a .tlog with several.")]
+SystemOption = Annotated[
+    int, typer.Option("--system", help="MAVLink system id of the vehicle, of a .tlog with several.")
+]
 DAMAGED = 1  # exit code
 
 

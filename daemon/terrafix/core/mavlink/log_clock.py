@@ -1,9 +1,9 @@
 """Repairs the time stamps of a telemetry log by the autopilot's own time since its start.
 
-The computer that writes the log may begin in 1970, be set by NTP, by hand or to another time zone while it writes, and a
-byte on its disk may be damaged. The least difference between stamp and time since the start (the packet with the least
-latency) is constant while nothing of that happens; where it changes for good, the clock has jumped by as much. Packets
-that were held back by the link change it for a while only, and keep their stamps."""
+The computer that writes the log may begin in 1970, be set by NTP, by hand or to another time zone while it writes, and
+a byte on its disk may be damaged. The least difference between stamp and time since the start (the packet with the
+least latency) is constant while nothing of that happens; where it changes for good, the clock has jumped by as much.
+Packets that were held back by the link change it for a while only, and keep their stamps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,11 +49,9 @@ class _Stretch:
     correction_us: int = 0  # to be added to its stamps
 
 
-def repaired(
-    stamps_us: Sequence[int], boot_us: Sequence[int | None], numbers: Sequence[int | None]
-) -> Repaired:
-    """``stamps_us``: of all records. ``boot_us``: time since the start of one autopilot, None where a packet does not say
-    it. ``numbers``: sequence numbers of that autopilot's packets, None for others."""
+def repaired(stamps_us: Sequence[int], boot_us: Sequence[int | None], numbers: Sequence[int | None]) -> Repaired:
+    """``stamps_us``: of all records. ``boot_us``: time since the start of one autopilot, None where a packet does not
+    say it. ``numbers``: sequence numbers of that autopilot's packets, None for others."""
     stretches = _stretches(stamps_us, boot_us)
     if stretches is None:
         return _by_stamps(stamps_us)
@@ -107,9 +105,7 @@ def _correct(stretches: list[_Stretch], stamps_us: Sequence[int], boot_us: Seque
         used_us.append(now.correction_us)
 
 
-def _level(
-    stretch: _Stretch, stamps_us: Sequence[int], boot_us: Sequence[int | None], *, from_start: bool
-) -> int:
+def _level(stretch: _Stretch, stamps_us: Sequence[int], boot_us: Sequence[int | None], *, from_start: bool) -> int:
     """Least difference between stamp and time since the start, in the WINDOW_US at one end of a stretch."""
     end_us = _boot(boot_us, stretch.first if from_start else stretch.last)
     order = range(stretch.first, stretch.last + 1) if from_start else range(stretch.last, stretch.first - 1, -1)

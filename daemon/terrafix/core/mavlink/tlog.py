@@ -205,7 +205,9 @@ def jump_text(jump: Jump, at_s: float) -> str:
     """A jump of the log's clock in words; ``at_s``: when, from the zero of the log."""
     size_s = jump.size_us * 1e-6
     size = f"{size_s:+.1f} s" if abs(size_s) < 86_400 else f"{size_s / 86_400:+.2f} days"
-    how = "repaired by the autopilot's time" if jump.measured else "taken for no gap, since no packet says the true time"
+    how = (
+        "repaired by the autopilot's time" if jump.measured else "taken for no gap, since no packet says the true time"
+    )
     return f"the clock of the log jumps by {size} at {at_s:.1f} s: {how}"
 
 

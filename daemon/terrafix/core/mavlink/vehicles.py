@@ -17,8 +17,8 @@ ARDUPILOT_TYPES: dict[str, frozenset[int]] = {
 NO_VEHICLES = frozenset({5, 6, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})  # trackers, stations, components
 ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT
 ARMED_FLAG = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-# A vehicle whose attitude swings by more than this, or which is faster, is not standing. Compass and level of a standing
-# one wander by a degree or two; GNSS velocity has a noise of some 0.1 m/s.
+# A vehicle whose attitude swings by more than this, or which is faster, is not standing. Compass and level of a
+# standing one wander by a degree or two; GNSS velocity has a noise of some 0.1 m/s.
 MIN_SWING_RAD, MIN_SPEED_MPS = math.radians(6.0), 2.0
 SWING_SHARE = 0.02  # of the attitudes at each end that do not count, of a vehicle that is being handled
 

@@ -17,7 +17,7 @@ from terrafix.core.errors import SourceError
 from terrafix.core.mavlink.tlog import TelemetryLog
 from terrafix.core.toml_file import read_toml
 from terrafix.messages import Camera, Origin
-from terrafix.vision.sources.plausible import check_camera
+from terrafix.vision.sources.plausible import check_camera, check_centre
 
 START_SIGMA_M = 10.0  # a coordinate from a map or a phone before take-off
 YAW_SIGMA_DEG = 5.0  # compass of a small multirotor near its motors
@@ -124,11 +124,8 @@ def read_description(path: Path) -> Description:
         raise SourceError(
             f"{path}: [camera] distortion has {len(camera.distortion)} numbers; OpenCV takes 0, 4, 5, 8, 12 or 14"
         )
-    if camera and not (0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height):
-        raise SourceError(
-            f"{path}: [camera] cx, cy ({camera.cx:g}, {camera.cy:g}) lies outside the {camera.width}x{camera.height} "
-            "image; all of [camera] is in pixels of the stored frames"
-        )
+    if camera:
+        check_centre(path, camera)
     if description.start and description.start.ground_amsl_m is not None and description.start.alt_amsl_m is not None:
         raise SourceError(f"{path}: [start] has both ground_amsl_m and alt_amsl_m; they mean the same, keep one")
     return description
