@@ -50,11 +50,15 @@ class HeardVehicle:
         """Whether it does not just stand."""
         return self.speed_mps > MIN_SPEED_MPS or _swing_rad(self.angles_rad) > MIN_SWING_RAD
 
+    def name(self) -> str:
+        """ "1 (ArduCopter)"; of a vehicle without a known firmware its type."""
+        unknown = "no heartbeat" if self.vehicle_type is None else f"MAV_TYPE {self.vehicle_type}"
+        return f"{self.system_id} ({self.firmware or unknown})"
+
     def text(self) -> str:
-        name = self.firmware or ("unknown firmware" if self.vehicle_type is None else f"type {self.vehicle_type}")
         state = ("moves" if self.moves else "stands") if self.readings else "sends no telemetry"
         armed = ", armed" if self.armed else ""
-        return f"{self.system_id} ({name}, {len(self.angles_rad)} attitudes, {state}{armed})"
+        return f"{self.name()[:-1]}, {len(self.angles_rad)} attitudes, {state}{armed})"
 
 
 @dataclass(frozen=True)

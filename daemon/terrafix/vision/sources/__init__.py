@@ -39,6 +39,8 @@ def open_source(
     if not on_disk:
         raise SourceError(f"{spec}: no such flight folder, photo folder, video or camera; check the path")
     path = Path(spec).expanduser()
+    if camera is not None and not camera.expanduser().is_file():
+        raise SourceError(f"{camera}: no such camera description; check [source] camera")
     if path.name == "flight.toml" and path.is_file():
         path = path.parent
     if path.is_dir():

@@ -10,6 +10,15 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
+from terrafix.vision.sources.facts import (
+    Fact,
+    camera_facts,
+    log_facts,
+    mount_fact,
+    rate_facts,
+    start_fact,
+    telemetry_facts,
+)
 from terrafix.vision.sources.images import WRONG_SIZE, downscaled_camera, read_image
 from terrafix.vision.sources.plausible import check_heights
 from terrafix.vision.sources.table import Row, read_table
@@ -22,6 +31,7 @@ class FlightFolder:
 
     def __init__(self, folder: Path, start: tuple[float, float] | None = None) -> None:
         self.folder = folder
+        self._start_given = start is not None
         toml = folder / "flight.toml"
         self._description = read_description(toml)
         self._stored = camera_of(toml, self._description)
@@ -47,6 +57,25 @@ class FlightFolder:
 
     def map_hint(self) -> Path | None:
         return (self.folder / self._description.map).resolve() if self._description.map else None
+
+    def facts(self) -> list[Fact]:
+        description, times_s = self._description, [row.t_ns / 1e9 for row in self._rows]
+        stated = [row.state for row in self._rows if row.state is not None]
+        found = [
+            *camera_facts(self._stored, "[camera] of flight.toml"),
+            mount_fact(self._stored, "[mount] of flight.toml"),
+            start_fact(self._origin, "--start" if self._start_given else "[start] of flight.toml"),
+            *rate_facts(times_s, "frames"),
+        ]
+        if stated or self._log is None:
+            found += telemetry_facts(stated, "frames.csv")
+        if self._log is not None:
+            found += telemetry_facts(self._log.states, self._log.path.name)
+            found += log_facts(self._log, description.telemetry.tlog_t0_us is not None)
+        outside = sum(not -1e9 <= state.t_ns <= self._rows[-1].t_ns for state in self._states)
+        if outside and outside == len(self._states):
+            found.append(Fact("left out", "all telemetry: none of it lies within the times of the frames"))
+        return found
 
     def close(self) -> None:
         """No resource stays open between shots."""

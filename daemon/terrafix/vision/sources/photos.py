@@ -4,6 +4,7 @@ The body frame of such a flight is a virtual vehicle that carries the camera str
 At gimbal pitch -90 the image top points along the gimbal's yaw, so that is the body's yaw."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from datetime import datetime, timedelta
@@ -15,13 +16,15 @@ from terrafix.messages import Camera, Frame, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import Description, StartTable, camera_of, origin_of, read_description
 from terrafix.vision.sources.exif import PhotoInfo, read_info
-from terrafix.vision.sources.images import downscaled_camera, image_files, read_image
+from terrafix.vision.sources.facts import Fact, camera_facts, mount_fact, rate_facts, start_fact, telemetry_facts
+from terrafix.vision.sources.images import downscaled_camera, image_files, is_image_name, read_image
 from terrafix.vision.sources.plausible import check_camera, check_heights
 from terrafix.vision.sources.xmp import PIX4D, BodyAngles, Xmp
 
 GIMBAL_TOLERANCE_DEG = 3.0  # a stabilised gimbal that reports its attitude
 EXIF_FOCAL_SIGMA = 0.03  # the focal length in EXIF is rounded, or a 35 mm equivalent, and ignores distortion
 UNKNOWN_TOLERANCE_DEG = 10.0  # the mount angle of the camera is unknown
+MAX_NAMED = 3  # files of a kind that are named
 MAX_OTHER_LENS_SHARE = 0.1  # of the photos: up to here they are left out, above it which lens is meant is asked
 _ZERO_NAMES = {"agl_m": "a height", "heading_deg": "a heading", "angles": "camera angles"}
 UNTIMED_STEP_S = 1.0  # photos without times: ordered by name, one per second
@@ -54,6 +57,7 @@ class Photos:
         heights_m = [i.xmp.agl_m for i in infos if i is not None and i.xmp.agl_m is not None]
         check_heights(folder, heights_m, "the height", "photos")
         self._origin = self._make_origin(first, downscaled_camera(self._stored), start)
+        self._start_given = start is not None
 
     def origin(self) -> Origin:
         return self._origin
@@ -66,6 +70,45 @@ class Photos:
 
     def map_hint(self) -> Path | None:
         return (self._where.parent / self._description.map).resolve() if self._description.map else None
+
+    def facts(self) -> list[Fact]:
+        """Where each number of the photos comes from."""
+        known = [info for _, info, _ in self._photos if info is not None]
+        described, lens = self._where.name, self._first.lens
+        whence = f"[camera] of {described}" if self._description.camera else f"{lens.focal_from} of the photos"
+        notes = [f"camera {self._first.model or 'unknown'}"] if not self._description.camera else []
+        angles = Counter(info.xmp.angles.source for info in known if info.xmp.angles is not None)
+        mount = f"[mount] of {described}" if self._description.camera else _counted(angles, len(known))
+        start = "--start" if self._start_given else f"[start] of {described}" if self._description.start else "GPS"
+        gps = "GPS of the first photo; that of the others is not used" if start == "GPS" else start
+        states = [state for _, info, _ in self._photos if info is not None and (state := state_of(info, 0)) is not None]
+        heights = Counter(info.xmp.agl_from for info in known if info.xmp.agl_m is not None)
+        found = [
+            *camera_facts(self._stored, whence, [*notes, *(lens.notes if not self._description.camera else ())]),
+            mount_fact(self._stored, mount or "nothing: the photos do not say it"),
+            start_fact(self._origin, gps),
+            *(
+                Fact("height", f"{_counted(heights, len(known))}") if fact.topic == "height" and heights else fact
+                for fact in telemetry_facts(states, "the photos")
+            ),
+            Fact("clock", _clock_text(known)),
+            *rate_facts([t_s for _, _, t_s in self._photos], "photos"),
+        ]
+        return [*found, *self._left_out()]
+
+    def _left_out(self) -> Iterator[Fact]:
+        for note, count in Counter(n for _, i, _ in self._photos if i is not None for n in i.xmp.notes).items():
+            yield Fact("left out", f"{note} ({count} photos)")
+        for group in self._lenses[1:]:
+            yield Fact("left out", f"another lens: {lens_text(group)}")
+        unreadable = [path.name for path, info, _ in self._photos if info is None]
+        if unreadable:
+            yield Fact("left out", f"{len(unreadable)} that cannot be read: {', '.join(unreadable[:MAX_NAMED])}")
+        others = sorted(path.name for path in self.folder.iterdir() if path.is_file())
+        others = [n for n in others if not is_image_name(n) and n not in ("flight.toml", self._where.name)]
+        if others:
+            more = f" and {len(others) - MAX_NAMED} more" if len(others) > MAX_NAMED else ""
+            yield Fact("left out", f"files that are no photos: {', '.join(others[:MAX_NAMED])}{more}")
 
     def close(self) -> None:
         """No resource stays open between shots."""
@@ -140,6 +183,19 @@ def _with_start(description: Description, lat_deg: float, lon_deg: float) -> Des
         telemetry=description.telemetry,
         start=StartTable(lat_deg=lat_deg, lon_deg=lon_deg),
     )
+
+
+def _counted(sources: Counter[str], count: int) -> str:
+    """ "gimbal angles of DJI in 35 of 36 photos"; empty without sources."""
+    return ", ".join(f"{source} in {n} of {count} photos" for source, n in sources.most_common())
+
+
+def _clock_text(infos: list[PhotoInfo]) -> str:
+    timed = sum(info.taken is not None for info in infos)
+    if not timed:
+        return "no photo has a time: one a second in the order of their names"
+    fractions = "with" if any(info.has_subsec for info in infos) else "without"
+    return f"DateTimeOriginal of {timed} of {len(infos)} photos, {fractions} fractions of a second"
 
 
 def state_of(info: PhotoInfo, t_ns: int) -> VehicleState | None:

@@ -11,6 +11,7 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
+from terrafix.vision.sources.facts import Fact, camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
 from terrafix.vision.sources.table import read_table
 
 FFMPEG_QUIET = "-8"  # AV_LOG_QUIET; a damaged image would otherwise print one line per block
@@ -30,6 +31,7 @@ class Video:
     ) -> None:
         self.path = path
         where = camera or self._find_description()
+        self._where, self._start_given = where, start is not None
         self._description = read_description(where)
         self._map_base = where.parent
         self._origin = origin_of(self._description, camera_of(where, self._description), start)
@@ -63,6 +65,20 @@ class Video:
 
     def map_hint(self) -> Path | None:
         return (self._map_base / self._description.map).resolve() if self._description.map else None
+
+    def facts(self) -> list[Fact]:
+        described = f"[camera] of {self._where.name}"
+        found = [
+            *camera_facts(self._origin.camera, described),
+            mount_fact(self._origin.camera, f"[mount] of {self._where.name}"),
+            start_fact(self._origin, "--start" if self._start_given else f"[start] of {self._where.name}"),
+            Fact("clock", "times of the container"),
+            Fact("rate", f"{1 / self._period_s:g} images a second of {self._fps:.3g} ([source] rate_hz)"),
+            *telemetry_facts(self._states, "the telemetry beside the video"),
+        ]
+        if self._log is not None:
+            found += log_facts(self._log, self._description.telemetry.tlog_t0_us is not None)
+        return found
 
     def close(self) -> None:
         """No resource stays open between shots."""
