@@ -137,10 +137,12 @@ def _placed(
     times_us = [stamp + correction_us.get(i, 0) for i, stamp in enumerate(stamps_us)]
     first = stretches[0].first
     damaged = 0
+    first_clocks = {stretch.correction_us - reference_us for stretch in stretches[:2]}
     for i in range(first - 1, -1, -1):
-        times_us[i] += correction_us[first]
-        if not -MAX_SILENCE_US < times_us[i] - times_us[i + 1] <= MIN_JUMP_US:
-            times_us[i], damaged = times_us[i + 1], damaged + 1
+        low_us, high_us = times_us[i + 1] - MAX_SILENCE_US, times_us[i + 1] + MIN_JUMP_US
+        fitting = [t for clock in first_clocks if low_us < (t := stamps_us[i] + clock) <= high_us]
+        damaged += not fitting
+        times_us[i] = max(fitting, default=times_us[i + 1])
     for before, after in pairwise(timed):
         assert before is not None
         until = len(stamps_us) if after is None else after
@@ -171,12 +173,8 @@ def _lasting(stretches: list[_Stretch]) -> list[_Stretch]:
 
 def _brief(stretches: list[_Stretch]) -> list[_Stretch]:
     """Single records with a clock of their own: damaged stamps."""
-    found = []
-    for i, stretch in enumerate(stretches):
-        others = {s.correction_us for s in (*stretches[max(0, i - 1) : i], *stretches[i + 1 : i + 2])}
-        if stretch.count == 1 and others and stretch.correction_us not in others:
-            found.append(stretch)
-    return found
+    clocks = {stretch.correction_us for stretch in stretches if stretch.count > 1}
+    return [s for s in stretches if s.count == 1 and clocks and s.correction_us not in clocks]
 
 
 def _by_stamps(stamps_us: Sequence[int]) -> Repaired:

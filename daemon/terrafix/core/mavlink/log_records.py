@@ -37,7 +37,7 @@ def record(t_us: int, packets: bytes) -> bytes:
 
 def read_records(data: bytes, crc_extra: Mapping[int, int]) -> Records:
     """``crc_extra``: the byte of each message that is known, which enters its checksum. A message that is not known is
-    taken where the next record begins behind it. Without records, or where most stamps are no time (a stream of packets
+    taken where its stamp is a time and the next record begins behind it. Without records, or where most stamps are no time (a stream of packets
     without stamps), all lists are empty."""
     packets: list[bytes] = []
     stamps_us: list[int] = []
@@ -75,8 +75,9 @@ def _record_end(data: bytes, at: int, crc_extra: Mapping[int, int]) -> int:
     known = crc_extra.get(address(data[start : start + 10])[2])
     if known is not None:
         return end if checksum_fits(data[start:end], known) else 0
-    at_end = end == len(data)
-    return end if at_end or (end + STAMP < len(data) and data[end + STAMP] in (_V1, _V2)) else 0
+    has_time = int.from_bytes(data[at:start], "big") < MAX_TIME_US
+    follows = end == len(data) or (end + STAMP < len(data) and data[end + STAMP] in (_V1, _V2))
+    return end if has_time and follows else 0
 
 
 def checksum_fits(packet: bytes, crc_extra: int) -> bool:
@@ -89,9 +90,8 @@ def checksum_fits(packet: bytes, crc_extra: int) -> bool:
 
 def packet_length(data: bytes, offset: int) -> int:
     """Length of the packet at ``offset`` in bytes; 0: no packet begins there. From the MAVLink serialisation guide."""
-    if data[offset] == _V2 and offset + 2 < len(data):
-        signature = 13 if data[offset + 2] & _SIGNED else 0
-        return 12 + data[offset + 1] + signature
+    if data[offset] == _V2 and offset + 2 < len(data) and data[offset + 2] in (0, _SIGNED):
+        return 12 + data[offset + 1] + (13 if data[offset + 2] else 0)
     return 8 + data[offset + 1] if data[offset] == _V1 and offset + 1 < len(data) else 0
 
 
