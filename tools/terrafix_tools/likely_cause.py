@@ -36,12 +36,12 @@ def likely_cause(
     matched = of_odometry.get(Verdict.ACCEPTED, 0)
     if matched < MATCHED_SHARE * frames:
         return (
-            f"the frames do not match each other either ({matched} of {frames}): they are blurred, empty, too far apart "
-            "or out of order"
+            f"the frames do not match each other either ({matched} of {frames}): they are blurred, empty, too far "
+            "apart or out of order"
         )
     return (
         f"{matched} of {frames} frames match each other, and none the map: focal length, height, mount, heading or map "
-        "is wrong, and no monitor has measured which; `terrafix source info` says where each comes from"
+        "is wrong, and no monitor measured which; `terrafix source info` says where each comes from"
     )
 
 

@@ -64,7 +64,7 @@ class HealthNode:
     def _band(self, hottest: TemperatureZone | None) -> tuple[ThermalBand, str]:
         """-> (band by temperature, its cause in words)."""
         if hottest is None:
-            which = "of [health] zones" if self._settings.zones else "temperature zone"
+            which = "zone of [health] zones" if self._settings.zones else "temperature zone"
             return ThermalBand.NORMAL, f"no {which} is readable: taken for normal"
         limits = ((ThermalBand.CRITICAL, self._settings.critical_c), (ThermalBand.HOT, self._settings.hot_c))
         for band, enter_c in limits:

@@ -45,7 +45,7 @@ def check_lines(config: Config, mission: Path | None, out: Path) -> Iterator[Lin
         yield _correlation(config)
     yield _clock()
     yield _disk(config, out)
-    yield _temperature(config)
+    yield temperature_line(config)
 
 
 def _map(config: Config, mission: Path | None) -> Iterator[Line]:
@@ -196,7 +196,7 @@ def _disk(config: Config, out: Path) -> Line:
     return ok("disk", f"{free_mb} MB free in {folder}")
 
 
-def _temperature(config: Config) -> Line:
+def temperature_line(config: Config) -> Line:
     thermal = Path(config.health.sysfs_root) / "class" / "thermal"
     zones, throttling = read_zones(thermal), read_throttling(thermal)
     if throttling:

@@ -37,8 +37,8 @@ def record(t_us: int, packets: bytes) -> bytes:
 
 def read_records(data: bytes, crc_extra: Mapping[int, int]) -> Records:
     """``crc_extra``: the byte of each message that is known, which enters its checksum. A message that is not known is
-    taken where its stamp is a time and the next record begins behind it. Without records, or where most stamps are no time (a stream of packets
-    without stamps), all lists are empty."""
+    taken where its stamp is a time and the next record begins behind it. Without records, or where most stamps are no
+    time (a stream of packets without stamps), all lists are empty."""
     packets: list[bytes] = []
     stamps_us: list[int] = []
     skipped = 0

@@ -25,6 +25,7 @@ WIDE_ASPECT = 1.6  # a wider photo is a crop of a 4:3 sensor; the 35 mm equivale
 ASPECT_TOLERANCE = 0.02  # a size rounded to whole pixels and to the blocks of a JPEG keeps its aspect within this
 # A calibrated principal point is within a few percent of the middle; farther away the calibration is of another size.
 MAX_OFF_CENTRE = 0.1  # of the width and of the height
+MAX_UNEQUAL = 0.06  # of the sizes that both coordinates of the principal point tell: it is within 1.5 % of the middle
 # Two statements of one focal length that differ by more: the 35 mm equivalent is rounded, and refers to diagonals or to
 # widths, which differ by a fifth.
 MAX_DISAGREEMENT = 1.5
@@ -129,9 +130,10 @@ def _by_centre(
         return 1.0, None, ""
     for quarter, (x, y) in ((False, centre_px), (True, centre_px[::-1])):
         across, along = 2 * x / width, 2 * y / height
-        if not (across > 0 and along > 0) or max(across, along) > (1.0 + 2 * MAX_OFF_CENTRE) * min(across, along):
+        near = max(abs(across - 1.0), abs(along - 1.0)) <= 2 * MAX_OFF_CENTRE
+        if not near and not 0.0 < max(across, along) <= (1.0 + MAX_UNEQUAL) * min(across, along):
             continue
-        by = 1.0 if max(abs(across - 1.0), abs(along - 1.0)) <= 2 * MAX_OFF_CENTRE else 2.0 / (across + along)
+        by = 1.0 if near else 2.0 / (across + along)
         # Of a photo that was turned, or whose size is guessed, the offset from the middle is not known.
         return by, None if quarter or turned or by != 1.0 else centre_px, ""
     x, y = centre_px
