@@ -155,7 +155,7 @@ def test_photos_of_two_lenses_are_refused_with_both_groups(tmp_path: Path) -> No
 def test_a_changing_zoom_is_several_lenses(tmp_path: Path) -> None:
     for i, zoom in enumerate((1.0, 1.0, 2.0, 2.0, 3.0)):
         photo(tmp_path / f"{i}.jpg", dji(**CALIBRATED), at_s=i, zoom=zoom)
-    with pytest.raises(SourceError, match="several lenses or zooms.* and 1 more"):
+    with pytest.raises(SourceError, match=r"several lenses or zooms.* and 1 more"):
         open_source(str(tmp_path))
 
 
@@ -269,7 +269,7 @@ def test_files_of_macos_and_windows_beside_photos_are_left_out(tmp_path: Path) -
     assert "._DJI_0000.JPG" in left_out and "and 2 more" in left_out
     for path in tmp_path.glob("DJI*"):
         path.unlink()
-    with pytest.raises(SourceError, match="neither a flight folder .* nor a folder of photos"):
+    with pytest.raises(SourceError, match=r"neither a flight folder .* nor a folder of photos"):
         open_source(str(tmp_path))
 
 

@@ -207,7 +207,8 @@ def _format(name: str, characters: str, columns: str) -> Format | None:
 def _converted(values: np.ndarray, character: str) -> np.ndarray:
     if values.dtype.kind == "S":
         return np.array([text.split(b"\0")[0].decode("utf-8", "replace") for text in values.tolist()], dtype=object)
-    return values.astype(np.float64) / _CHARACTERS[character][1]
+    with np.errstate(invalid="ignore"):  # damaged bytes are any float
+        return values.astype(np.float64) / _CHARACTERS[character][1]
 
 
 def _read_text(data: bytes, wanted: set[str]) -> DataFlash:

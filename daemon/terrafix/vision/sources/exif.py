@@ -4,7 +4,7 @@ Reference: EXIF 2.32 (JEITA CP-3451E) for the tags; ``xmp`` for the rest."""
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -34,10 +34,10 @@ class PhotoInfo:
     taken: datetime | None = None  # local time of the camera; valid for differences only
     has_subsec: bool = False
     model: str = ""
-    lens: Lens = Lens()
+    lens: Lens = field(default_factory=Lens)
     lat_deg: float | None = None
     lon_deg: float | None = None
-    xmp: Xmp = Xmp()
+    xmp: Xmp = field(default_factory=Xmp)
 
     @property
     def focal_px(self) -> float | None:
