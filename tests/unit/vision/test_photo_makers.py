@@ -54,7 +54,7 @@ def photo(path: Path, xmp: str = "", *, at_s: int = 0, size: tuple[int, int] = (
         f"<rdf:Description {xmp}/></rdf:RDF></x:xmpmeta>"
     )
     image = Image.fromarray(picture(at_s, *size))
-    image.save(path, quality=90, exif=exif, **({"xmp": packet.encode()} if xmp else {}))
+    image.save(path, quality=90, exif=exif, xmp=packet.encode() if xmp else b"")
     return path
 
 
@@ -244,7 +244,7 @@ def test_what_is_exactly_zero_in_all_photos_is_not_reported(xmp: str, unknown: s
 def test_the_height_of_autel_and_pix4d_is_read(tmp_path: Path) -> None:
     photo(tmp_path / "a.jpg", pix4d(Yaw="10.0", Pitch="0.0", Roll="0.0", AboveGroundAltitude="119.50"), focal_35=24)
     (state,) = next(iter(open_source(str(tmp_path)).shots())).states
-    assert (state.agl_m, state.yaw_rad) == (119.5, pytest.approx(math.radians(10.0)))
+    assert state.agl_m == 119.5 and state.yaw_rad == pytest.approx(math.radians(10.0))
 
 
 def test_the_calibrated_focal_length_of_pix4ds_tags_needs_the_size_of_a_pixel(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ class Target:
 
     name: str
     seeds: Callable[[], list[bytes]]
-    run: Callable[[bytes], None]
+    run: Callable[[bytes], object]
 
 
 def _in_file(suffix: str, read: Callable[[Path], object]) -> Callable[[bytes], None]:
