@@ -19,7 +19,7 @@ def texts_of(left_out: list[bool], error: str = OVERTAKEN) -> list[str]:
 def test_a_computer_that_leaves_out_most_frames_is_reported_once_and_so_is_its_recovery() -> None:
     slow, fast = [i % 4 != 0 for i in range(60)], [False] * 60
     assert texts_of(fast + slow + fast) == [
-        "Terrafix: computer too slow: 11 of 21 frames out",
+        "Terrafix: computer too slow: 11 of 20 frames out",
         "Terrafix: computer keeps up again",
     ]
 
@@ -32,6 +32,5 @@ def test_unreadable_images_are_no_slow_computer() -> None:
     assert texts_of([True] * 100, error="truncated") == []
 
 
-def test_a_share_between_the_limits_changes_nothing() -> None:
-    between = [i % 5 < 2 for i in range(200)]  # 40 %
-    assert texts_of(between) == [] and len(texts_of([True] * 30 + between)) == 1
+def test_a_load_at_the_limit_is_reported_seldom() -> None:
+    assert len(texts_of(([True] * 20 + [False] * 20) * 10)) <= 10  # 200 s; 20 changes
