@@ -6,7 +6,7 @@ from terrafix.link.pilot_text.debounce import Debounce
 from terrafix.link.pilot_text.statustext import INFO, WARNING, statustext
 from terrafix.messages import OVERTAKEN, Frame, StatusText
 
-FRAMES = 20  # newest frames that are counted [spec: 10 s at the default of [source] rate_hz]
+FRAMES = 20  # newest frames that are counted [spec: 10 s at the default frame rate of 2 Hz]
 
 
 class FrameLoad:
