@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import typer
 
+import input_table
 import project_tables
 from terrafix_tools.cli import app
 
@@ -125,6 +126,17 @@ def test_the_architecture_page_has_the_generated_table() -> None:
     assert text == project_tables.page(text), "run: .venv/bin/python tests/rigs/project_tables.py"
 
 
+def test_the_page_of_inputs_has_the_generated_tables_and_every_row_names_tests_that_exist() -> None:
+    text = input_table.PAGE.read_text(encoding="utf-8")
+    assert text == input_table.page(text), "run: .venv/bin/python tests/rigs/input_table.py"
+    for row in (row for rows in input_table.TABLES.values() for row in rows):
+        file, names = row.tests
+        source = (ROOT / "tests" / "unit" / file).read_text(encoding="utf-8")
+        assert names, f"{row.quantity}: no test holds this row"
+        for name in names:
+            assert f"def {name}(" in source, f"{row.quantity}: {file} has no {name}"
+
+
 def test_files_named_on_the_architecture_page_exist() -> None:
     text = project_tables.PAGE.read_text(encoding="utf-8")
     for name in re.findall(r"`((?:\w+/)+\w+\.py)`", text):
@@ -139,7 +151,9 @@ def test_functions_named_beside_files_on_the_architecture_page_exist() -> None:
         file = next(ROOT / folder / name for folder in ("daemon/terrafix", "tools") if (ROOT / folder / name).is_file())
         code = file.read_text(encoding="utf-8")
         for function in filter(None, functions):
-            assert re.search(rf"^ *(?:def|class) {function}\b", code, flags=re.M), f"{name} has no {function}"
+            assert re.search(rf"^(?: *(?:def|class) {function}\b|{function}\b.* = )", code, flags=re.M), (
+                f"{name} has no {function}"
+            )
 
 
 NOT_OURS = {"validate_gpkg.py", "test_NAME.py"}  # of GDAL; a placeholder

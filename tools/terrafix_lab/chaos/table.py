@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from terrafix.core.errors import OutputError, SourceError
-from terrafix_lab.chaos.faults import FAULTS
-from terrafix_lab.chaos.scene import Phase
 from terrafix_lab.chaos.verdict import NO_FIX, Outcome
+from terrafix_lab.faults.fault import Phase
+from terrafix_lab.faults.table import FAULTS, MATRIX
 from terrafix_tools.report.text import GAP_S
 
 # A dark cell is without effect up to this time from the last black image to a fix.
@@ -27,7 +27,7 @@ def line(outcome: Outcome) -> str:
         "not recorded": _s(outcome.not_recorded_s),
         "stop": _s(outcome.stop_s),
     }
-    shown = ", ".join(f"{name} {value}" for name, value in figures.items())
+    shown = ", ".join(f"{name} {value}" for name, value in {**figures, **outcome.criteria}.items())
     return f"{outcome.fault:28} {outcome.phase:21} {shown}: {outcome.verdict}"
 
 
@@ -52,16 +52,16 @@ def is_without_effect(outcome: Outcome) -> bool:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Faults with an effect by phases, of the phases of which there is any outcome; the names of the other faults, and
-    of those not flown; a line that sums all cells up."""
+    """Faults with an effect by phases, of the phases of which there is any outcome; the names of the other faults that
+    were flown, and of those of MATRIX that were not; a line that sums all cells up."""
     flown = [o for o in outcomes if o.verdict != NO_FIX]
     phases = [phase for phase in Phase if any(o.phase == phase for o in outcomes)]
     rows = [f"| fault | {' | '.join(phases)} |", f"|---|{'---|' * len(phases)}"]
     quiet, missing = [], []
-    for fault in FAULTS:
+    for fault in FAULTS.values():
         of = {o.phase: o for o in flown if o.fault == fault.name}
         if not of:
-            missing.append(fault.name)
+            missing += [fault.name] if fault in MATRIX else []
         elif len(of) == len(phases) and all(is_without_effect(o) for o in of.values()):
             quiet.append(fault.name)
         else:
