@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from terrafix.core.errors import UsageError
 from terrafix_lab.faults.edits import EVER, Edit, OriginEdit, Span, unchanged
+from terrafix_lab.faults.messages import MatchEdit
 
 if TYPE_CHECKING:
     from terrafix_lab.chaos.rig import Rig
@@ -28,6 +29,7 @@ class Need(StrEnum):
     """What a fault needs beside frames, telemetry and a map. ROOT: only root can mount it."""
 
     PROCESSES = "the real processes"
+    MATCHES = "map matches as messages between nodes in one process"
     LIVE = "a live camera"
     PIXELS = "images"
     SEARCH = "a search over the map"
@@ -62,7 +64,8 @@ class Process:
 @dataclass(frozen=True)
 class Fault:
     """One row of the table. ``lasts_s`` None: from the first frame to the last. ``source``: the edit of the shots in a
-    span. ``origin``: an edit of start and camera, for the whole flight. ``is_true``: no input is false, some are
+    span. ``origin``: an edit of start and camera, for the whole flight. ``matches``: makes an edit of
+    the map matches. ``is_true``: no input is false, some are
     missing. ``no_fix_in``: phases of the fault matrix in which no fix is expected after it."""
 
     name: str
@@ -70,6 +73,7 @@ class Fault:
     lasts_s: float | None = None
     source: Callable[[Span], Edit] | None = None
     origin: OriginEdit | None = None
+    matches: Callable[[], MatchEdit] | None = None
     process: Process | None = None
     needs: frozenset[Need] = frozenset()
     is_true: bool = False
@@ -96,15 +100,16 @@ class Fault:
 
 
 CAMPAIGNS = {  # command -> what its driver has
-    "terrafix accept --scenario": frozenset({Need.PIXELS, Need.SEARCH, Need.UNKNOWN}),
-    "terrafix montecarlo --fault": frozenset({Need.UNKNOWN}),
-    "terrafix chaos --fault": frozenset(Need) - {Need.UNKNOWN},
+    "terrafix accept --scenario": frozenset({Need.MATCHES, Need.PIXELS, Need.SEARCH, Need.UNKNOWN}),
+    "terrafix montecarlo --fault": frozenset({Need.MATCHES, Need.UNKNOWN}),
+    "terrafix chaos --fault": frozenset(Need) - {Need.MATCHES, Need.UNKNOWN},
 }
 
 
 def lacking(command: str, fault: Fault) -> list[Need]:
     """What a fault needs that ``command``, a key of CAMPAIGNS, has not."""
-    needed = fault.needs | ({Need.PROCESSES} if fault.process is not None else set())
+    of_parts = {Need.PROCESSES: fault.process, Need.MATCHES: fault.matches}
+    needed = fault.needs | {need for need, part in of_parts.items() if part is not None}
     return sorted(needed - CAMPAIGNS[command])
 
 

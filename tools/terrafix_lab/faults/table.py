@@ -9,6 +9,7 @@ from terrafix.core.errors import UsageError
 from terrafix_lab.faults import edits, pictures
 from terrafix_lab.faults.edits import Edit, Span, StateEdit, during
 from terrafix_lab.faults.fault import Fault, Need
+from terrafix_lab.faults.messages import outliers
 from terrafix_lab.faults.processes import AROUND_THEM, KILLED_AND_LIMITED, SHORT_S
 
 FROZEN_S, FORGED_S, LATE_S, FALLING_BEHIND_S = 15.0, 10.0, 1.0, 40.0
@@ -237,6 +238,13 @@ IMPRECISE_INPUTS = (
         "heading unknown", "No heading is reported.", source=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
     ),
 )
+MATCHES = (
+    Fault(
+        "350 m outlier fix",
+        "Every tenth map fix has an error of 350 m and a small covariance: it is rejected.",
+        matches=outliers,
+    ),
+)
 INPUTS = {fault.name: fault for fault in (*CAMERA, *FALSE_INPUTS)}
 SCENARIOS: tuple[Fault, ...] = (  # of several faults
     in_turn(
@@ -247,7 +255,9 @@ SCENARIOS: tuple[Fault, ...] = (  # of several faults
     ),
 )
 MATRIX = (NONE, *KILLED_AND_LIMITED, *CAMERA, *AROUND_THEM)  # what `terrafix chaos` flies if no fault is named
-FAULTS = {fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *SCENARIOS)}
+FAULTS = {
+    fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *MATCHES, *SCENARIOS)
+}
 
 
 def fault_named(name: str) -> Fault:
