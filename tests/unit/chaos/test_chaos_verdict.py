@@ -219,7 +219,7 @@ def sent(name: str) -> list[tuple[bytes, int]]:
         Recorded() as stream,
         StreamedCamera(stream, lambda _t_s: jpeg(), lambda: time.monotonic() - began_s, 10.0) as camera,
     ):
-        camera.edit = FAULTS[name].edit(Span(0.0, 1e9, name))
+        camera.edit = FAULTS[name].of_camera(Span(0.0, 1e9, name))
         time.sleep(0.15)
         stream.pushed.clear()
         time.sleep(0.5)

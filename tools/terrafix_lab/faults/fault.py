@@ -63,15 +63,16 @@ class Process:
 
 @dataclass(frozen=True)
 class Fault:
-    """One row of the table. ``lasts_s`` None: from the first frame to the last. ``source``: the edit of the shots in a
-    span. ``origin``: an edit of start and camera, for the whole flight. ``matches``: makes an edit of
-    the map matches. ``is_true``: no input is false, some are
-    missing. ``no_fix_in``: phases of the fault matrix in which no fix is expected after it."""
+    """One row of the table. ``lasts_s`` None: from the first frame to the last. ``source``: the edit of frames in a
+    span; ``telemetry``: of what the autopilot reports, one shot for each. ``origin``: an edit of start and camera, for the
+    whole flight. ``matches``: makes an edit of the map matches. ``is_true``: no input is false, some are missing.
+    ``no_fix_in``: phases of the fault matrix in which no fix is expected after it."""
 
     name: str
     words: str = ""
     lasts_s: float | None = None
     source: Callable[[Span], Edit] | None = None
+    telemetry: Callable[[Span], Edit] | None = None
     origin: OriginEdit | None = None
     matches: Callable[[], MatchEdit] | None = None
     process: Process | None = None
@@ -79,11 +80,19 @@ class Fault:
     is_true: bool = False
     no_fix_in: frozenset[Phase] = frozenset({Phase.LANDING})  # it ends below the least height for matching
 
+    def of_camera(self, span: Span) -> Edit:
+        return self._edit(self.source, span)
+
+    def of_telemetry(self, span: Span) -> Edit:
+        return self._edit(self.telemetry, span)
+
     def edit(self, span: Span) -> Edit:
-        """Of the source; the fault of a whole flight hits also what comes before the first frame."""
-        if self.source is None:
-            return unchanged
-        return self.source(EVER if self.lasts_s is None else span)
+        """Of camera and telemetry."""
+        return lambda shots: self.of_telemetry(span)(self.of_camera(span)(shots))
+
+    def _edit(self, part: Callable[[Span], Edit] | None, span: Span) -> Edit:
+        """The fault of a whole flight hits also what comes before the first frame."""
+        return unchanged if part is None else part(EVER if self.lasts_s is None else span)
 
     @property
     def flight_s(self) -> float:

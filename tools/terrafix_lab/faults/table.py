@@ -35,15 +35,16 @@ def shown(change: pictures.Change) -> Callable[[Span], Edit]:
 
 
 def in_turn(name: str, words: str, *faults: Fault) -> Fault:
-    """Faults of the source that follow each other, each as long as it lasts."""
+    """Faults of camera or telemetry that follow each other, each as long as it lasts."""
 
-    def source(span: Span) -> Edit:
-        spans = list(accumulate((f.lasts_s or 0.0 for f in faults), initial=span.from_s))
-        edited = [f.edit(Span(a, b, f.name)) for f, (a, b) in zip(faults, pairwise(spans), strict=True)]
+    def each(part: Callable[[Fault, Span], Edit], span: Span) -> Edit:
+        begins_s = accumulate((f.lasts_s or 0.0 for f in faults), initial=span.from_s)
+        edited = [part(f, Span(a, b, f.name)) for f, (a, b) in zip(faults, pairwise(begins_s), strict=True)]
         return lambda shots: reduce(lambda given, edit: edit(given), edited, shots)
 
+    camera, reports = partial(each, Fault.of_camera), partial(each, Fault.of_telemetry)
     needs, lasts_s = frozenset().union(*(f.needs for f in faults)), sum(f.lasts_s or 0.0 for f in faults)
-    return Fault(name, words, lasts_s, source, needs=needs, is_true=all(f.is_true for f in faults))
+    return Fault(name, words, lasts_s, camera, reports, needs=needs, is_true=all(f.is_true for f in faults))
 
 
 NONE = Fault("none", lasts_s=0.0, is_true=True)
@@ -106,7 +107,7 @@ FALSE_INPUTS = (
         Fault(
             f"heading {off} degrees off",
             f"The reported heading is off by {off} degrees throughout.",
-            source=reported(edits.turned(off)),
+            telemetry=reported(edits.turned(off)),
         )
         for off in (90, 180)
     ),
@@ -122,14 +123,14 @@ FALSE_INPUTS = (
     Fault(
         "roll and pitch swapped",
         "Roll is reported as pitch, and pitch as roll.",
-        source=reported(edits.roll_pitch_swapped),
+        telemetry=reported(edits.roll_pitch_swapped),
     ),
     Fault(
         "roll and pitch negated",
         "Roll and pitch are reported with the wrong sign.",
-        source=reported(edits.roll_pitch_negated),
+        telemetry=reported(edits.roll_pitch_negated),
     ),
-    *(Fault(name, words, source=reported(edits.height_times(factor))) for name, words, factor in HEIGHTS),
+    *(Fault(name, words, telemetry=reported(edits.height_times(factor))) for name, words, factor in HEIGHTS),
     *(
         Fault(
             f"focal length {word}",
@@ -188,7 +189,7 @@ FALSE_INPUTS = (
     Fault(
         "telemetry 2 s late",
         "All that the autopilot reports is two seconds old when it gets its time.",
-        source=whole(edits.late_telemetry(LATE_TELEMETRY_S)),
+        telemetry=whole(edits.late_telemetry(LATE_TELEMETRY_S)),
     ),
     Fault(
         "pictures 1 s late",
@@ -199,10 +200,13 @@ FALSE_INPUTS = (
         "forged tilt",
         "For 10 s a roll is reported that is 15 degrees more than the true one.",
         FORGED_S,
-        reported(edits.rolled(15.0)),
+        telemetry=reported(edits.rolled(15.0)),
     ),
     Fault(
-        "forged heading", "For 10 s the reported heading jumps by 90 degrees.", FORGED_S, reported(edits.turned(90.0))
+        "forged heading",
+        "For 10 s the reported heading jumps by 90 degrees.",
+        FORGED_S,
+        telemetry=reported(edits.turned(90.0)),
     ),
 )
 # True inputs, of which some are missing or imprecise: the position must stay good.
@@ -214,7 +218,11 @@ SCARCE_INPUTS = (
         is_true=True,
     ),
     Fault(
-        "height unknown", "No height is reported.", source=reported(edits.height_unknown), needs=UNKNOWN, is_true=True
+        "height unknown",
+        "No height is reported.",
+        telemetry=reported(edits.height_unknown),
+        needs=UNKNOWN,
+        is_true=True,
     ),
     Fault(
         "start unknown", "No start is known.", origin=edits.start_unknown, needs=frozenset({Need.SEARCH}), is_true=True
@@ -225,17 +233,17 @@ IMPRECISE_INPUTS = (
     Fault(
         "height wrong by 10 %",
         "The reported height is 10 % too large.",
-        source=reported(edits.height_times(1.10)),
+        telemetry=reported(edits.height_times(1.10)),
         is_true=True,
     ),
     Fault(
         "compass wrong by 15 degrees",
         "The reported heading is off by 15 degrees.",
-        source=reported(edits.turned(15.0)),
+        telemetry=reported(edits.turned(15.0)),
         is_true=True,
     ),
     Fault(
-        "heading unknown", "No heading is reported.", source=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
+        "heading unknown", "No heading is reported.", telemetry=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
     ),
 )
 MATCHES = (
