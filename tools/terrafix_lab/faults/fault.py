@@ -64,8 +64,8 @@ class Process:
 @dataclass(frozen=True)
 class Fault:
     """One row of the table. ``lasts_s`` None: from the first frame to the last. ``source``: the edit of frames in a
-    span; ``telemetry``: of what the autopilot reports, one shot for each. ``origin``: an edit of start and camera, for the
-    whole flight. ``matches``: makes an edit of the map matches. ``is_true``: no input is false, some are missing.
+    span; ``telemetry``: of what the autopilot reports, one shot for each. ``origin``: an edit of start and camera, for
+    the whole flight. ``matches``: makes an edit of the map matches. ``is_true``: no input is false, some are missing.
     ``no_fix_in``: phases of the fault matrix in which no fix is expected after it."""
 
     name: str
