@@ -12,12 +12,11 @@ from terrafix_lab.faults.fault import Fault, Need
 from terrafix_lab.faults.messages import outliers
 from terrafix_lab.faults.processes import AROUND_THEM, KILLED_AND_LIMITED, SHORT_S
 
-FROZEN_S, FORGED_S, LATE_S, FALLING_BEHIND_S = 15.0, 10.0, 1.0, 40.0
+FROZEN_S, FORGED_S, LATE_S = 15.0, 10.0, 1.0
 BUFFERS = 4
 STILL_SHARE, LATE_TELEMETRY_S = 0.5, 2.0
 DROPPED, DOUBLED, SEED = 0.15, 0.15, 1
-PIXELS, LIVE = frozenset({Need.PIXELS}), frozenset({Need.LIVE})
-UNKNOWN = frozenset({Need.UNKNOWN})
+PIXELS, UNKNOWN = frozenset({Need.PIXELS}), frozenset({Need.UNKNOWN})
 
 
 def whole(edit: Edit) -> Callable[[Span], Edit]:
@@ -48,52 +47,23 @@ def in_turn(name: str, words: str, *faults: Fault) -> Fault:
 
 
 NONE = Fault("none", lasts_s=0.0, is_true=True)
+
+
+def camera(name: str, words: str, source: Callable[[Span], Edit], *needs: Need) -> Fault:
+    return Fault(f"camera: {name}", words, SHORT_S, source, needs=frozenset(needs), is_true=True)
+
+
 CAMERA = (
-    Fault("camera: unplugged", "No frame comes.", SHORT_S, edits.unplugged, is_true=True),
-    Fault("camera: frozen", "One picture again and again.", SHORT_S, pictures.frozen, is_true=True),
-    Fault("camera: black", "Black pictures.", SHORT_S, pictures.black, is_true=True),
-    Fault(
-        "camera: overexposed",
-        "All but the darkest ground is white.",
-        SHORT_S,
-        shown(pictures.overexposed),
-        needs=PIXELS,
-        is_true=True,
-    ),
-    Fault("camera: defocused", "Blurred pictures.", SHORT_S, shown(pictures.defocused), needs=PIXELS, is_true=True),
-    Fault(
-        "camera: wrong resolution",
-        "Half the width and height.",
-        SHORT_S,
-        shown(pictures.halved),
-        needs=PIXELS,
-        is_true=True,
-    ),
-    Fault("camera: no JPEG", "Bytes that are no image.", SHORT_S, pictures.torn, is_true=True),
-    Fault(
-        "camera: each image ten times",
-        "Ten times the frames.",
-        SHORT_S,
-        partial(edits.repeated, times=10),
-        needs=LIVE,
-        is_true=True,
-    ),
-    Fault(
-        "camera: stamps 5 s ahead",
-        "Time stamps in the future.",
-        SHORT_S,
-        partial(edits.stamped, by_s=5.0),
-        needs=LIVE,
-        is_true=True,
-    ),
-    Fault(
-        "camera: stamps 3 s late",
-        "Time stamps in the past.",
-        SHORT_S,
-        partial(edits.stamped, by_s=-3.0),
-        needs=LIVE,
-        is_true=True,
-    ),
+    camera("unplugged", "No frame comes.", edits.unplugged),
+    camera("frozen", "One picture again and again.", pictures.frozen),
+    camera("black", "Black pictures.", pictures.black),
+    camera("overexposed", "All but the darkest ground is white.", shown(pictures.overexposed), Need.PIXELS),
+    camera("defocused", "Blurred pictures.", shown(pictures.defocused), Need.PIXELS),
+    camera("wrong resolution", "Half the width and height.", shown(pictures.halved), Need.PIXELS),
+    camera("no JPEG", "Bytes that are no image.", pictures.torn),
+    camera("each image ten times", "Ten times the frames.", partial(edits.repeated, times=10), Need.LIVE),
+    camera("stamps 5 s ahead", "Time stamps in the future.", partial(edits.stamped, by_s=5.0), Need.LIVE),
+    camera("stamps 3 s late", "Time stamps in the past.", partial(edits.stamped, by_s=-3.0), Need.LIVE),
 )
 HEIGHTS = (
     ("height 30 % low", "The reported height is 30 % too small, and stated as good.", 0.7),
