@@ -6,7 +6,7 @@ from html import escape
 
 import numpy as np
 
-from terrafix_tools.finalise.before_after import HEADER, Change, kept_line
+from terrafix_tools.before_after import HEADER, Change, kept_line
 from terrafix_tools.report import document
 from terrafix_tools.report.charts import HALF_WIDTH, Chart, clock
 from terrafix_tools.report.data import FlightView, radius95_m
