@@ -96,7 +96,7 @@ FLIGHT_INPUTS: tuple[Row, ...] = (
         "time stamps of the records",
         "microseconds",
         "since 1970, of the logging computer",
-        "jumps above 1 s and damaged stamps are repaired by the autopilot's time; without it a jump counts as no gap",
+        "jumps above 1 s and damaged stamps are repaired by the autopilot's time; without it a jump is no gap",
         "packets without time stamps",
         (
             "autopilot_log/test_log_clock_and_vehicles.py",
