@@ -54,7 +54,7 @@ class Orientation:
         return msgspec.structs.replace(odometry, two_view=[tuple(row) for row in pairs.reshape(-1, 4).tolist()])
 
 
-# The symmetries of a square but for the identity.
+# [spec: symmetries of a square but for the identity]
 ORIENTATIONS = tuple(
     Orientation(deg, mirrored) for mirrored, deg in product((False, True), (0, 90, 180, -90)) if mirrored or deg
 )
