@@ -66,15 +66,24 @@ def simulated(seed: int) -> InertialFlight:
     return InertialFlight(seed, SECONDS, FRAME_EVERY)
 
 
-def flown(seed: int, change: Change, matches: Callable[[int], int | None], frames: int = END + 16) -> Flown:
-    """``change``: of the odometry of a frame of the fault, whose keyframe is one of them, too; the first begins a
-    fragment. ``matches``: the frame whose place the map match of a frame of the fault has; None: it has none."""
+def flown(
+    seed: int,
+    change: Change,
+    matches: Callable[[int], int | None],
+    frames: int = END + 16,
+    first: Change | None = None,
+) -> Flown:
+    """``change``: of the odometry of a frame of the fault, whose keyframe is one of them, too. ``first``: of the first
+    one, whose keyframe is before the fault; None: it begins a fragment. ``matches``: the frame whose place the map
+    match of a frame of the fault has; None: it has none."""
     flight, run = simulated(seed), EstimatorRun()
     rng, result = np.random.default_rng([seed, 56]), Flown()
     run.feed([ORIGIN])
     for i in range(frames):
         telemetry = [m for m in flight.messages_by_frame[i] if not isinstance(m, Odometry | MapMatch)]
-        odometry, *found = images(flight, i, rng, change, matches)
+        odometry, *found = images(
+            flight, i, rng, first if i == FIRST and first else change, matches, tied=first is not None
+        )
         replies = run.feed([*telemetry, odometry])
         if any(isinstance(reply, Prediction) for reply in replies):  # the anchor matches those frames only
             replies += run.feed(found)
@@ -91,12 +100,18 @@ def flown(seed: int, change: Change, matches: Callable[[int], int | None], frame
 
 
 def images(
-    flight: InertialFlight, i: int, rng: np.random.Generator, change: Change, matches: Callable[[int], int | None]
+    flight: InertialFlight,
+    i: int,
+    rng: np.random.Generator,
+    change: Change,
+    matches: Callable[[int], int | None],
+    *,
+    tied: bool,
 ) -> list[Message]:
-    """Odometry and map match of frame ``i``."""
+    """Odometry and map match of frame ``i``. ``tied``: the first frame of the fault is tied to the keyframe before."""
     t_ns, faulty = round(i * FRAME_S * 1e9), FIRST <= i < END
-    keyframe, fragment = max((i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY, 0), (i >= FIRST) + (i >= END)
-    if i in (0, FIRST, END):
+    keyframe, fragment = max((i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY, 0), (i >= FIRST and not tied) + (i >= END)
+    if i in (0, END) or (i == FIRST and not tied):
         odometry = Odometry(
             t_ns=t_ns, frame_id=i, keyframe_id=i, verdict=Verdict.ACCEPTED, becomes_keyframe=True, fragment_id=fragment
         )
@@ -147,6 +162,26 @@ def test_turned_or_mirrored_pictures_are_named_and_refused(orientation: Orientat
     assert not accepted & set(range(FIRST, END))
     assert len([e for e, _ in result.claimed(FIRST * FRAME_S) if e.frame_id < END]) > 20  # by inertial readings
     assert result.is_back(3.0)
+
+
+@pytest.mark.parametrize("turned_deg", [90, 180, -90])
+def test_a_picture_that_turns_from_one_frame_to_the_next_is_no_turn_of_the_vehicle(turned_deg: int) -> None:
+    """Features tie the first turned image to the keyframe before it."""
+    orientation = Orientation(turned_deg)
+    inverse = np.linalg.inv(orientation.matrix)
+
+    def turned_alone(odometry: Odometry, _: np.random.Generator) -> Odometry:
+        pairs = np.array(odometry.two_view)
+        return with_pairs(odometry, np.hstack([pairs[:, :2], pairs[:, 2:] @ inverse.T]))
+
+    result = flown(1, seen_as(orientation), lambda _: None, END, turned_alone)
+    verdicts = result.odometry()
+    assert verdicts[FIRST] is Verdict.IMPLAUSIBLE
+    assert Verdict.ACCEPTED not in {verdicts[i] for i in range(FIRST, END)}
+    assert not [v for v in result.verdicts if v.measurement in ("attitude", "heading")]
+    assert not result.lies()
+    faults = [m for m in result.published if isinstance(m, CalibrationFault)]
+    assert [(m.quantity, m.active) for m in faults] == [(orientation.quantity, True)]
 
 
 def four_times_as_fast(odometry: Odometry, _: np.random.Generator) -> Odometry:
