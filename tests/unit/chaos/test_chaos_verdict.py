@@ -156,6 +156,29 @@ def test_the_camera_shows_what_its_fault_says() -> None:
     assert decoded(altered(good, Look.TORN)) is None
 
 
+def test_the_camera_comes_back_turned_mirrored_squeezed_or_jittering() -> None:
+    smooth = cv2.GaussianBlur(np.random.default_rng(2).normal(128.0, 300.0, (90, 160)), (0, 0), 6.0)
+    good = cv2.imencode(".jpg", np.clip(smooth, 0, 255).astype(np.uint8))[1].tobytes()
+    image, turned, mirrored, squeezed, *jittering = (
+        decoded(altered(good, look, number)).astype(float)  # type: ignore[union-attr]
+        for look, number in (
+            (Look.GOOD, 0),
+            (Look.UPSIDE_DOWN, 0),
+            (Look.MIRRORED, 0),
+            (Look.SQUEEZED, 0),
+            (Look.JITTERING, 1),
+            (Look.JITTERING, 2),
+        )
+    )
+    near = 4.0  # grey values: of compression
+    assert np.abs(turned[::-1, ::-1] - image).mean() < near < np.abs(turned - image).mean()
+    assert np.abs(mirrored[:, ::-1] - image).mean() < near < np.abs(mirrored - image).mean()
+    assert np.abs(squeezed[:, 79] - image[:, 79]).mean() < near  # about the centre
+    assert np.abs(squeezed[:, 50] - image[:, 40]).mean() < near < np.abs(squeezed[:, 50] - image[:, 50]).mean()
+    assert [np.abs(one - image).mean() < near for one in jittering] == [True, True]
+    assert not np.array_equal(*jittering)
+
+
 def copter(t_s: float) -> PeerState:
     """Climbs to AGL_M in 50 s, flies straight to 80 s, turns by 90 degrees in 3 s, and lands from 120 s on."""
     agl_m = AGL_M * min(1.0, t_s / 50.0, max(0.0, (170.0 - t_s) / 50.0))

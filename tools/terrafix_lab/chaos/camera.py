@@ -15,6 +15,8 @@ from terrafix_lab.sim.flights.folder import FRAME_HZ
 
 EXPOSURE_GAIN = 6.0  # of the overexposed image: all but the darkest ground is white
 DEFOCUS_PX = 12.0  # 1-sigma of the blur
+JITTER_PX = 0.4  # 1-sigma of the shift of a jittering image
+SQUEEZED_BY = 4.0 / 3.0  # in x: 16:9 in 4:3
 SLACK = 1e-3  # share of a period: an image that is sent so much too early is the one that is due
 NS = 1_000_000_000
 
@@ -33,8 +35,13 @@ class Look(StrEnum):
     TEN_TIMES = "ten times"  # each image ten times, 20 a second
     AHEAD = "stamps ahead"  # time stamps 5 s in the future
     LATE = "stamps late"  # time stamps 3 s in the past
+    JITTERING = "jittering"  # frozen, and shifted by a fraction of a pixel each time
+    UPSIDE_DOWN = "upside down"  # as after a restart of the camera with another rotation
+    MIRRORED = "mirrored"
+    SQUEEZED = "squeezed"  # the axes of a picture of 16:9 in 4:3, cropped to its size
 
 
+FROZEN = (Look.FROZEN, Look.JITTERING)
 SHIFT_NS = {Look.AHEAD: 5 * NS, Look.LATE: -3 * NS}
 
 
@@ -72,21 +79,21 @@ class StreamedCamera:
             look, now_ns, flight_s = self.look, time.monotonic_ns(), self._flight_s()
             late_s = flight_s - math.floor(flight_s * self._frame_hz + SLACK) / self._frame_hz
             good = self._image_at(flight_s - late_s)
-            self._frozen = good if look is not Look.FROZEN else self._frozen
+            self._frozen = self._frozen if look in FROZEN else good
             if look is not Look.NOTHING:
                 stamp_ns = now_ns - round(1e9 * late_s) + SHIFT_NS.get(look, 0)
-                self._stream.push_jpeg(self._frozen if look is Look.FROZEN else altered(good, look), stamp_ns)
+                self._stream.push_jpeg(altered(self._frozen, look, self.pushed), stamp_ns)
                 self.pushed += 1
             spent_s = (time.monotonic_ns() - now_ns) / 1e9
             period_s = 1.0 / self._frame_hz / (10.0 if look is Look.TEN_TIMES else 1.0)
             wait_s = max(0.0, period_s - spent_s - (late_s if look is not Look.TEN_TIMES else 0.0))
 
 
-def altered(jpeg: bytes, look: Look) -> bytes:
-    """The image as a camera with this fault sends it."""
+def altered(jpeg: bytes, look: Look, number: int = 0) -> bytes:
+    """The image as a camera with this fault sends it. ``number``: of the image, seed of its jitter."""
     if look is Look.TORN:
         return jpeg[: len(jpeg) // 3][::-1]
-    if look not in (Look.BLACK, Look.OVEREXPOSED, Look.DEFOCUSED, Look.SMALL):
+    if look in (Look.GOOD, Look.NOTHING, Look.FROZEN, Look.TEN_TIMES, *SHIFT_NS):
         return jpeg
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
@@ -96,9 +103,26 @@ def altered(jpeg: bytes, look: Look) -> bytes:
         image = cv2.convertScaleAbs(image, alpha=EXPOSURE_GAIN, beta=60)
     elif look is Look.DEFOCUSED:
         image = cv2.GaussianBlur(image, (0, 0), DEFOCUS_PX)
+    elif look is Look.UPSIDE_DOWN:
+        image = cv2.rotate(image, cv2.ROTATE_180)
+    elif look is Look.MIRRORED:
+        image = cv2.flip(image, 1)
+    elif look is Look.SQUEEZED:
+        image = _scaled(image, 1.0 / SQUEEZED_BY, (0.0, 0.0))
+    elif look is Look.JITTERING:
+        shift = np.random.default_rng([number, 59]).normal(0.0, JITTER_PX, 2)
+        image = _scaled(image, 1.0, (float(shift[0]), float(shift[1])))
     else:
         image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+def _scaled(image: np.ndarray, by: float, shift_px: tuple[float, float]) -> np.ndarray:
+    """With the x axis scaled about the centre, then shifted; the edge is repeated."""
+    height, width = image.shape[:2]
+    middle = 0.5 * (width - 1)
+    change = np.array([[by, 0.0, middle * (1.0 - by) + shift_px[0]], [0.0, 1.0, shift_px[1]]])
+    return np.asarray(cv2.warpAffine(image, change, (width, height), borderMode=cv2.BORDER_REPLICATE))
 
 
 def camera_toml(camera: Camera, attitude_sigma_deg: float | None = None) -> str:
