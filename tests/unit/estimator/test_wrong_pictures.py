@@ -160,6 +160,8 @@ def test_turned_or_mirrored_pictures_are_named_and_refused(orientation: Orientat
     assert faults[0].factor == (orientation.turned_deg if orientation.quantity == "picture turned" else None)
     accepted = {frame for frame, verdict in result.odometry().items() if verdict is Verdict.ACCEPTED}
     assert not accepted & set(range(FIRST, END))
+    predicted = {m.frame_id for m in result.published if isinstance(m, Prediction)}
+    assert not predicted & set(range(round(faults[0].t_ns * 1e-9 / FRAME_S), END))  # the anchor would lose the place
     assert len([e for e, _ in result.claimed(FIRST * FRAME_S) if e.frame_id < END]) > 20  # by inertial readings
     assert result.is_back(3.0)
 

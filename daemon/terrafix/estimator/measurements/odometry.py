@@ -134,7 +134,6 @@ class OdometryMeasurement:
             motion = self._relative_motion(orientation.righted(seen.odometry), frame)
             others[orientation] = likelihood(motion) if isinstance(motion, KeyframeMotion) else None
         monitor.add(likelihood(seen), others)
-        monitor.refuses = monitor.fault is not None and not innovation.gated.is_accepted
 
     def _is_flipped(
         self, seen: KeyframeMotion, frame: FrameInput, before: NodeState, innovation: MotionInnovation

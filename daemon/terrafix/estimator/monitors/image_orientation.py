@@ -61,7 +61,7 @@ ORIENTATIONS = tuple(
 
 
 class OrientationMonitor:
-    """``refuses``: the fault is active, and the newest frame shows it, so that nothing else can be learnt of it."""
+    """``refuses``: the fault is active, and the newest frame shows it, so that the map can tell nothing of it."""
 
     def __init__(self) -> None:
         limit = threshold(FRAMES_PER_HOUR, len(ORIENTATIONS))
@@ -88,3 +88,6 @@ class OrientationMonitor:
             other = MIN_LOG_LIKELIHOOD if likelihood is None else max(likelihood, MIN_LOG_LIKELIHOOD)
             test.add(-MAX_STEP if likelihood is None else other - max(upright, MIN_LOG_LIKELIHOOD))
             self._fits[orientation] = FIT_MEMORY * self._fits[orientation] + other
+        fault = self.fault
+        shown = None if fault is None else others[fault]
+        self.refuses = shown is not None and shown > upright
