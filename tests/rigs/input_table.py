@@ -41,11 +41,9 @@ def table(rows: tuple[Row, ...]) -> str:
 def page(text: str) -> str:
     """The text of the page with all tables generated."""
     for name, rows in TABLES.items():
+        made = table(rows)
         text, count = re.subn(
-            rf"(<!-- table: {name} -->).*?(<!-- end -->)",
-            lambda m, t=table(rows): f"{m[1]}\n{t}\n{m[2]}",
-            text,
-            flags=re.S,
+            rf"(<!-- table: {name} -->).*?(<!-- end -->)", lambda m, t=made: f"{m[1]}\n{t}\n{m[2]}", text, flags=re.S
         )
         assert count == 1, f"{PAGE}: the marks of the table '{name}' are missing"
     return text

@@ -18,7 +18,8 @@ def map_build(
     *,
     out: Annotated[Path, typer.Option(help="Map package to write (.gpkg).")],
     area: Annotated[
-        str, typer.Option(help="W,S,E,N in degrees, .kml, .geojson, QGroundControl .plan or ArduPilot .waypoints.")
+        str,
+        typer.Option(help="W,S,E,N in degrees, .kml, .kmz, .geojson, QGroundControl .plan or ArduPilot .waypoints."),
     ] = "",
     buffer: Annotated[float | None, typer.Option(help="Kilometres around the area; default 20.")] = None,
     corridor: Annotated[

@@ -110,6 +110,8 @@ def _cover(package: MapPackage, mission: Path) -> Iterator[Line]:
         yield fail("mission", f"leaves the map for {where(outside[0])}", "move the mission, or build a larger map")
     else:
         yield ok("mission", f"its {course.along_m[-1] / 1000:.1f} km lie on the map")
+    for note in plan.notes:
+        yield warn("mission", note, "if the vehicle flies to it, put a waypoint there")
 
 
 def _camera(config: Config) -> Iterator[Line]:

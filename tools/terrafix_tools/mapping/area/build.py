@@ -135,6 +135,8 @@ def _layers(order: Order, area: Area) -> list[LayerInput] | None:
     specs = _specs(order)
     size_km2 = check_area(area)
     order.say.print(f"{area.name}: {size_km2:,.1f} km2 with its buffer", highlight=False)
+    for note in area.notes:
+        order.say.print(f"{area.name}: {note}", highlight=False)
     if order.buffer_km is None and order.corridor_km is None:
         order.say.print(_area_hint(order.area), highlight=False)
     preparation = Preparation(Request(area, specs, order.cache_dir, order.out, order.gsd_m), order.say)

@@ -103,7 +103,7 @@ def check(
     """Checks the whole map and the mission. Raises MapError, SourceError (mission or camera), UsageError."""
     found = package.layer(layer)
     lens, lens_name = _camera(camera)
-    plan = read_mission(mission) if mission else None
+    plan = read_mission(mission, course_only=True) if mission else None
     agl_m = _flight_height_m(agl_m, plan)
     west, south, east, north = package.manifest.bounds_wgs84
     frame = LocalFrame((south + north) / 2, (west + east) / 2)
@@ -146,6 +146,7 @@ def check(
         warnings=[
             *_warnings(found, int(min(frame_m) / cell_m), package.manifest.has_dem, cell_m, agl_m),
             *_search_warnings(local, matcher, agl_m),
+            *(f"{plan.name}: {note}" for note in (plan.notes if plan else ())),
         ],
         mission=mission_check,
     )
