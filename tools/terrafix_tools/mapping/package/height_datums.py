@@ -1,4 +1,4 @@
-"""Names of the vertical datums; separate from their conversion, so that --help is fast."""
+"""Names of the vertical datums and units; separate from their conversion, so that --help is fast."""
 
 from enum import StrEnum
 
@@ -9,3 +9,11 @@ class Datum(StrEnum):
     EGM96 = "egm96"  # mean sea level of receivers, autopilots and SRTM
     EGM2008 = "egm2008"  # Copernicus GLO-30
     ELLIPSOID = "ellipsoid"  # WGS84; often from photogrammetry with RTK
+
+
+class Unit(StrEnum):
+    """Unit of heights."""
+
+    METRE = "m"
+    FOOT = "ft"
+    US_FOOT = "us-ft"
