@@ -50,15 +50,15 @@ def crs_of(dataset: Any, path: Path) -> CRS:
             crs = listed
     if not (crs.is_projected or crs.is_geographic or crs.is_bound):
         raise MapError(f"{path}: coordinate system '{crs.name}' is not on the earth; reproject with gdalwarp -t_srs")
-    check_datum(dataset, crs, path)
+    check_datum(dataset, path)
     return crs
 
 
-def check_datum(dataset: Any, crs: CRS, path: Path) -> tuple[str, ...]:
-    """What is assumed about the datum. Raises MapError: not named, or without a known way to WGS 84, and on an
+def check_datum(dataset: Any, path: Path) -> tuple[str, ...]:
+    """What is assumed about the datum that the file itself names. Raises MapError: not named, or without a known way to WGS 84, and on an
     ellipsoid whose datums are hundreds of metres apart."""
-    base = crs.source_crs if crs.is_bound else crs
-    assert base is not None
+    crs = _horizontal(CRS.from_wkt(dataset.crs.to_wkt()))
+    base = (crs.source_crs if crs.is_bound else None) or crs
     named = bool(base.datum) and not UNNAMED.search(_datum_name(base))
     shift = list(crs.coordinate_operation.towgs84) if crs.is_bound and crs.coordinate_operation else []
     if any(shift):
@@ -81,10 +81,10 @@ def accuracy_to_wgs84(crs: CRS, x: float, y: float, assumed: tuple[str, ...]) ->
     """Accuracy in metres of the way from a coordinate system to WGS 84 at (x, y) in it; None: not stated; and the grid
     of a better way that PROJ lacks. ``assumed``: as ``check_datum`` returns it."""
     way = way_to_wgs84(crs, x, y)
-    if way.is_ballpark:
-        return EARTH_CENTRED_ACCURACY_M, ()
+    if assumed and not crs.is_bound:
+        return max(EARTH_CENTRED_ACCURACY_M, way.accuracy_m or 0.0), ()
     if way.accuracy_m is None:
-        return EARTH_CENTRED_ACCURACY_M if assumed and not crs.is_bound else None, ()
+        return None, ()
     better = _missing_grid(crs, x, y, way.accuracy_m)
     return way.accuracy_m, (better,) if better else ()
 

@@ -101,7 +101,7 @@ class ImagerySource:
     def statements(self) -> tuple[InputStatement, ...]:
         """What the file was taken for."""
         crs, file = self._own_crs, self._file
-        assumed = check_datum(file, crs, self.path)
+        assumed = check_datum(file, self.path)
         x, y = file.transform @ (file.width / 2, file.height / 2)
         accuracy_m, missing = accuracy_to_wgs84(crs, x, y, assumed)
         if not self._nodata_is_held:

@@ -6,6 +6,10 @@ import msgspec
 
 from terrafix.core.config import Map
 from terrafix.map.format import Ce90Origin, InputStatement
+from terrafix.map.package import MapPackage
+from terrafix_tools.mapping.datum import way_to_wgs84
+
+IMAGERY = "imagery"
 
 
 def accuracy_with_datum(
@@ -35,3 +39,20 @@ def merged(statements: Sequence[InputStatement], limited: str) -> list[InputStat
         assumed = (*common.assumed, limited) if limited else common.assumed
         lines.append(msgspec.structs.replace(common, name=name, assumed=assumed))
     return lines
+
+
+def way_here(package: MapPackage) -> str | None:
+    """A word when this computer's PROJ takes a worse way from the package's coordinate system to WGS 84 than the one at
+    its build: the package keeps its coordinate system, and positions are converted in flight. None: as good."""
+    stated = [s.accuracy_m for s in package.manifest.inputs if s.kind == IMAGERY and s.accuracy_m is not None]
+    if not stated:
+        return None
+    layer = package.layer(None)
+    x, y = (layer.bounds[0] + layer.bounds[2]) / 2, (layer.bounds[1] + layer.bounds[3]) / 2
+    way = way_to_wgs84(package.crs, x, y)
+    if way.accuracy_m is None or way.accuracy_m <= max(stated):
+        return None
+    return (
+        f"positions in '{package.crs.name}' are good to {way.accuracy_m:g} m here, and were to {max(stated):g} m where "
+        f"the map was built: PROJ uses '{way.name}'"
+    )

@@ -27,7 +27,7 @@ SHORT = {  # letters of a unit as programs write it -> its name in PROJ's databa
     "us survey ft": US_FOOT, "sft": US_FOOT, "cm": "centimetre", "centimeter": "centimetre", "mm": "millimetre",
     "millimeter": "millimetre", "km": "kilometre", "kilometer": "kilometre", "yd": "yard", "fathom": "fathom",
 }  # fmt: skip
-DECIMETRES = {"dm", "decimetre", "decimeter"}  # not in PROJ's database
+DECIMETRES = {"dm", "decimetre", "decimeter"}  # PROJ's database (9.5) gives a decimeter 0.01 m
 OF_UNIT = {Unit.METRE: METRE, Unit.FOOT: FOOT, Unit.US_FOOT: US_FOOT}
 SAME = 1e-5  # relative: a foot and a US survey foot are one to a height
 
@@ -116,7 +116,7 @@ def height_statement(
 ) -> InputStatement:
     """``crs``, ``centre``: horizontal coordinate system and a place in it; ``note``: what was done with the heights."""
     values = "" if (heights.scale, heights.offset) == (1.0, 0.0) else f", x {heights.scale:g} + {heights.offset:g}"
-    assumed = check_datum(file, crs, path)
+    assumed = check_datum(file, path)
     accuracy_m, missing = accuracy_to_wgs84(crs, *centre, assumed)
     return InputStatement(
         name=path.name,
@@ -136,7 +136,7 @@ def _lengths() -> dict[str, float]:
 def _metres(unit: str) -> float | None:
     """Length of a unit by its name or abbreviation; None: not known."""
     letters = " ".join(re.findall(r"[a-z]+", unit.lower()))
-    for name in (letters, letters.removesuffix("s")):
+    for name in (unit.strip().lower(), letters, letters.removesuffix("s")):
         if name in DECIMETRES:
             return 0.1
         if (found := _lengths().get(SHORT.get(name, name).lower())) is not None:
