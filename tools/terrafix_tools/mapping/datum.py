@@ -55,8 +55,8 @@ def crs_of(dataset: Any, path: Path) -> CRS:
 
 
 def check_datum(dataset: Any, path: Path) -> tuple[str, ...]:
-    """What is assumed about the datum that the file itself names. Raises MapError: not named, or without a known way to WGS 84, and on an
-    ellipsoid whose datums are hundreds of metres apart."""
+    """What is assumed about the datum that the file itself names. Raises MapError: not named, or without a known way to
+    WGS 84, and on an ellipsoid whose datums are hundreds of metres apart."""
     crs = _horizontal(CRS.from_wkt(dataset.crs.to_wkt()))
     base = (crs.source_crs if crs.is_bound else None) or crs
     named = bool(base.datum) and not UNNAMED.search(_datum_name(base))
@@ -97,7 +97,7 @@ def way_to_wgs84(crs: CRS, x: float, y: float) -> Way:
         used = transformer.get_last_used_operation()
     except ProjError:  # no operation, or none at this place: the caller's transformation says so
         return Way("", None, False)
-    accuracy = float(used.accuracy)
+    accuracy = 0.0 if used.description == "noop" else float(used.accuracy)  # noop: WGS 84 itself
     return Way(used.description, accuracy if accuracy >= 0.0 else None, BALLPARK in used.description)
 
 

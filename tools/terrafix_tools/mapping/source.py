@@ -1,6 +1,8 @@
 """Imagery for the map builder: any GDAL raster as north-up windows of 8-bit BGR with a mask."""
 
 import math
+import re
+import uuid
 import warnings
 from pathlib import Path
 from types import TracebackType
@@ -9,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+import rasterio.shutil
 from pyproj import CRS, Geod, Transformer
 from pyproj.exceptions import ProjError
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
@@ -22,6 +25,7 @@ from terrafix.map.format import InputStatement
 from terrafix_tools.mapping.datum import accuracy_to_wgs84, check_datum, crs_of
 from terrafix_tools.mapping.sources.utm import utm_epsg
 
+NODATA = re.compile("<NoDataValue>([^<]*)</NoDataValue>")
 SAMPLE_PX = 1024  # side of the downsampled image that determines the value range of deep pixels
 STRETCH_PERCENT = (0.5, 99.5)  # percentiles of the sample; 16-bit and float pixels outside saturate
 
@@ -104,10 +108,11 @@ class ImagerySource:
         assumed = check_datum(file, self.path)
         x, y = file.transform @ (file.width / 2, file.height / 2)
         accuracy_m, missing = accuracy_to_wgs84(crs, x, y, assumed)
-        if not self._nodata_is_held:
-            assumed += (f"nodata value {file.nodata:g} ignored, {file.dtypes[0]} cannot hold it",)
-        elif self._file.nodata is not None and ColorInterp.alpha in file.colorinterp:
-            assumed += (f"the alpha band is the mask, and not nodata {file.nodata:g}",)
+        nodata = stated_nodata(file)
+        if nodata and (file.nodata is None or not self._nodata_is_held):
+            assumed += (f"nodata value {nodata} ignored, {file.dtypes[0]} cannot hold it",)
+        elif nodata and ColorInterp.alpha in file.colorinterp:
+            assumed += (f"the alpha band is the mask, and not nodata {nodata}",)
         return (
             InputStatement(
                 name=self.path.name,
@@ -250,6 +255,18 @@ class ImagerySource:
         return (low, high) if high > low else (low, low + 1.0)
 
 
+def stated_nodata(file: Any) -> str:
+    """The nodata value as the file states it, which rasterio leaves out where pixels cannot hold it; empty: none."""
+    name = f"/vsimem/{uuid.uuid4().hex}.vrt"
+    rasterio.shutil.copy(file, name, driver="VRT")
+    try:
+        with rasterio.open(name) as view:
+            found = NODATA.search(" ".join(view.tags(ns="xml:VRT").values()))
+    finally:
+        rasterio.shutil.delete(name)
+    return found[1] if found else ""
+
+
 def holds(dtype: str, nodata: float) -> bool:
     """Whether a pixel of this type can have the value."""
     kind = np.dtype(dtype)
@@ -302,6 +319,6 @@ def _check_place(dataset: Any, crs: CRS, path: Path) -> None:
 
 def _utm_of(dataset: Any, crs: CRS) -> CRS:
     """UTM zone of the centre: EPSG 326zz north, 327zz south."""
-    west, south, east, north = dataset.bounds
-    lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform((west + east) / 2, (south + north) / 2)
+    x, y = dataset.transform @ (dataset.width / 2, dataset.height / 2)
+    lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform(x, y)
     return CRS.from_epsg(utm_epsg(lon_deg, lat_deg))

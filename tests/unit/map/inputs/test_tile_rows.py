@@ -58,7 +58,9 @@ def levels(reader: MbtilesReader, first: Tile) -> list[int]:
     found = []
     for down in range(SIDE):
         data = reader.get(Tile(ZOOM, first.column, first.row + down))
-        found.append(-1 if data is None else int(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[0, 0, 0]))
+        found.append(
+            -1 if data is None else int(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[0, 0, 0])
+        )
     reader.close()
     return found
 
@@ -106,12 +108,11 @@ def test_bounds_that_fit_neither_reading_are_named(tmp_path: Path) -> None:
     assert levels(reader, first) == RIGHT
 
 
-@pytest.mark.parametrize("statement", ["UPDATE tiles SET zoom_level = 'x'", "UPDATE tiles SET zoom_level = 99",
-                                       "UPDATE tiles SET tile_row = NULL", "UPDATE tiles SET tile_row = -5"])  # fmt: skip
-def test_tiles_of_an_impossible_place_are_one_clear_line(tmp_path: Path, statement: str) -> None:
+@pytest.mark.parametrize("change", ["zoom_level = 'x'", "zoom_level = 99", "tile_row = NULL", "tile_row = -5"])
+def test_tiles_of_an_impossible_place_are_one_clear_line(tmp_path: Path, change: str) -> None:
     path, _ = write(tmp_path / "s.mbtiles", 48.14, north=False)
     db = sqlite3.connect(path)
-    db.execute(statement)
+    db.execute(f"UPDATE tiles SET {change}")
     db.commit()
     db.close()
     with pytest.raises(MapError, match=r"s\.mbtiles: a (zoom level|row)"):
