@@ -94,9 +94,12 @@ def way_to_wgs84(crs: CRS, x: float, y: float) -> Way:
     try:
         transformer = Transformer.from_crs(crs, 4326, always_xy=True)
         transformer.transform(x, y)
-        used = transformer.get_last_used_operation()
     except ProjError:  # no operation, or none at this place: the caller's transformation says so
         return Way("", None, False)
+    try:
+        used = transformer.get_last_used_operation()
+    except ProjError:  # there is only one
+        used = transformer
     accuracy = 0.0 if used.description == "noop" else float(used.accuracy)  # noop: WGS 84 itself
     return Way(used.description, accuracy if accuracy >= 0.0 else None, BALLPARK in used.description)
 

@@ -22,12 +22,12 @@ from map_geoids import undulation_m, write_geoid
 from terrafix.core.errors import MapError, UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import MapPackage
+from terrafix_lab.sim.ground.draped_image import open_ground
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.area.build import Order, build_order
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
 from terrafix_tools.mapping.package.height_datums import Datum, Unit
-from terrafix_tools.sim.ground.draped_image import open_ground
 
 CENTRE = (300_150.0, 2_599_850.0)  # of the imagery, EPSG:32651
 HIGH_M, SLOPE = 1600.0, 0.02

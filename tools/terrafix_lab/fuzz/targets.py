@@ -1,0 +1,325 @@
+"""Parsers of what comes from outside, as functions of bytes. Any input may be refused (TerrafixError, or a result that
+says so); any other exception is a bug."""
+
+import io
+import sqlite3
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from terrafix.core.config import Config, LinkSection
+from terrafix.core.config import load as load_config
+from terrafix.core.errors import TerrafixError
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.installed_files import installed_files
+from terrafix.core.mavlink.tlog import read_imu, read_tlog, record
+from terrafix.link.edge import MavlinkEdge
+from terrafix.link.node import LinkNode
+from terrafix.map.package import MapPackage
+from terrafix.messages import Camera, Frame, Message, Origin, StatusText
+from terrafix.recorder.provenance import header
+from terrafix.recorder.reader import ReadResult, read_received
+from terrafix.recorder.writer import FlightWriter
+from terrafix.vision.sources import parse_start
+from terrafix.vision.sources.description import read_description
+from terrafix.vision.sources.exif import read_info
+from terrafix.vision.sources.images import decode_image
+from terrafix.vision.sources.mjpeg import MjpegCapture
+from terrafix.vision.sources.table import read_table
+from terrafix_lab.sim.autopilot.fuzz_wire import UNIX_NS, Autopilot
+from terrafix_lab.sim.autopilot.wire import heartbeat
+from terrafix_lab.sim.closed_loop.loopback import Loopback
+from terrafix_tools.autopilot_log.read import read_autopilot_log
+from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.datum import crs_of
+from terrafix_tools.mapping.package.height_values import height_statement, heights_of
+from terrafix_tools.mapping.source import open_raster
+from terrafix_tools.mapping.sources.tiles.files import MbtilesReader
+from terrafix_tools.mapping.sources.tiles.grid import Tile
+from terrafix_tools.mission.file import read_mission
+
+WIDTH, HEIGHT = 64, 48  # of the images
+SIDE_PX = 300  # of the map
+COMMANDS = (22, 16, 17, 31, 82, 84, 177, 179, 189, 195, 600, 601, 20, 85, 60_000)  # of a mission
+STEPS = 40  # of the telemetry, 0.02 s each
+
+
+@dataclass(frozen=True)
+class Target:
+    """``seeds``: valid inputs; ``run`` raises only TerrafixError."""
+
+    name: str
+    seeds: Callable[[], list[bytes]]
+    run: Callable[[bytes], None]
+
+
+def _in_file(suffix: str, read: Callable[[Path], object]) -> Callable[[bytes], None]:
+    """Runs a reader of files; the file is in memory."""
+    folder = Path(tempfile.mkdtemp(prefix="terrafix-fuzz-", dir="/dev/shm"))
+    path = folder / f"input{suffix}"
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        read(path)
+
+    return run
+
+
+def _images() -> list[bytes]:
+    image = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    return [cv2.imencode(suffix, image)[1].tobytes() for suffix in (".jpg", ".png", ".webp", ".tiff", ".bmp")]
+
+
+def _configs() -> list[bytes]:
+    return [(installed_files() / "config" / "default.toml").read_bytes(), b'[link]\ndevice = "udpin:0.0.0.0:14550"\n']
+
+
+def _descriptions() -> list[bytes]:
+    cameras = installed_files() / "config" / "cameras"
+    start = b"\n[start]\nlat_deg = 48.0\nlon_deg = 11.0\nsigma_m = 10.0\n"
+    return [path.read_bytes() + start for path in sorted(cameras.glob("*.toml"))]
+
+
+def _tables() -> list[bytes]:
+    rows = "".join(f"{i:04d}.jpg,{0.5 * i},90,0,-1.5,100\n" for i in range(8))
+    return [f"file,t_s,yaw_deg,pitch_deg,roll_deg,agl_m\n{rows}".encode(), b"file,t_s\na.jpg,0\nb.jpg,1\n"]
+
+
+@cache
+def _telemetry() -> tuple[list[bytes], list[bytes]]:
+    """Packets of a short flight: as they arrive, and as a log."""
+    autopilot = Autopilot(signed=False)
+    packets = [packet for step in range(STEPS) for packet in autopilot.packets(step, step * 20_000_000, b"")]
+    log = b"".join(record(1_700_000_000_000_000 + 20_000 * i, packet) for i, packet in enumerate(packets))
+    return [b"".join(packets), heartbeat(42)], [log]
+
+
+@cache
+def _records() -> list[bytes]:
+    """A small flight record."""
+    camera = Camera(width=WIDTH, height=HEIGHT, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
+    origin = Origin(
+        t_ns=1, camera=camera, lat_deg=48.0, lon_deg=11.0, ground_amsl_m=500.0, start_sigma_m=10.0, yaw_sigma_deg=3.0,
+        agl_sigma_m=3.0, attitude_sigma_deg=1.0,
+    )  # fmt: skip
+    frames = [Frame(t_ns=i, frame_id=i, file="", width=WIDTH, height=HEIGHT) for i in range(30)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "flight.mcap"
+        writer = FlightWriter(path, header(Config()))
+        for message in (origin, *frames, StatusText(t_ns=40, severity=4, text="no map fix")):
+            writer.write(message, message.t_ns)
+        writer.close()
+        return [path.read_bytes()]
+
+
+@cache
+def _maps() -> list[bytes]:
+    """A small map package; needs GDAL."""
+    import rasterio
+    from rasterio.transform import Affine
+
+    from terrafix_tools.mapping.build import build
+
+    bands = np.random.default_rng(2).integers(1, 255, (3, SIDE_PX, SIDE_PX), np.uint8)
+    with tempfile.TemporaryDirectory() as folder:
+        tif, package = Path(folder) / "map.tif", Path(folder) / "map.gpkg"
+        profile = {"driver": "GTiff", "width": SIDE_PX, "height": SIDE_PX, "count": 3, "dtype": "uint8"}
+        transform = Affine(1.0, 0.0, 690_000.0, 0.0, -1.0, 5_330_000.0)
+        with rasterio.open(tif, "w", **profile, crs="EPSG:32632", transform=transform) as file:
+            file.write(bands)
+        build(tif, package, date="2024-01-01")
+        return [package.read_bytes()]
+
+
+def _read_map(path: Path) -> None:
+    package = MapPackage.open(path)
+    try:
+        west, south, east, north = package.manifest.bounds_wgs84
+        frame = LocalFrame(0.5 * (south + north), 0.5 * (west + east))
+        local = package.bind(frame)
+        local.window(-50.0, 50.0, 100, 100, 1.0)
+        local.elevation(np.zeros(1), np.zeros(1))
+        package.verify()
+    finally:
+        package.close()
+
+
+def _read_record(path: Path) -> None:
+    for _ in read_received(path, ReadResult()):
+        pass
+
+
+def _read_log(path: Path) -> None:
+    read_tlog(path)
+    read_imu(path)
+
+
+def _receive(data: bytes) -> None:
+    """MAVLink bytes through the edge and the node of the link."""
+    loopback, node = Loopback(), LinkNode(10.0)
+    edge = MavlinkEdge(LinkSection(), loopback, lambda: UNIX_NS)
+    for start in range(0, len(data), 512):
+        loopback.to_companion(data[start : start + 512])
+        now_ns = 20_000_000 * (1 + start // 512)
+        for message in (*_fed(node, edge.poll(now_ns)), *node.tick(now_ns)):
+            edge.on_message(message)
+
+
+def _fed(node: LinkNode, messages: Iterable[Message]) -> Iterable[Message]:
+    for message in messages:
+        yield message
+        yield from node.on(message)
+
+
+class _Response(io.BytesIO):
+    """What http.client gives for the body of a stream."""
+
+
+def _stream(data: bytes) -> None:
+    capture = MjpegCapture.__new__(MjpegCapture)
+    capture.stamp_ns, capture._jpeg, capture._at_part = None, b"", False
+    capture._response, capture._boundary = _Response(data), b"--frame"  # type: ignore[assignment]
+    while capture.grab():
+        capture.retrieve()
+
+
+def _streams() -> list[bytes]:
+    jpeg = _images()[0]
+    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\nX-Timestamp-Ns: 12\r\n\r\n".encode()
+    return [(head + jpeg + b"\r\n") * 3, (b"--frame\r\n\r\n" + jpeg + b"\r\n") * 3]
+
+
+def _missions() -> list[bytes]:
+    lines = [
+        "QGC WPL 110",
+        "0\t1\t0\t16\t0\t0\t0\t0\t48.0\t11.0\t500\t1",
+        "1\t0\t3\t22\t0\t0\t0\t0\t0\t0\t60\t1",
+        "2\t0\t3\t16\t0\t0\t0\t0\t48.001\t11.0\t60\t1",
+        "3\t0\t3\t21\t0\t0\t0\t0\t48.001\t11.0\t0\t1",
+    ]
+    item = '{"type":"SimpleItem","command":16,"frame":3,"params":[0,0,0,0,48.0,11.0,60]}'
+    plan = f'{{"fileType":"Plan","mission":{{"plannedHomePosition":[48.0,11.0,500],"items":[{item}]}}}}'
+    return ["\n".join(lines).encode(), plan.encode()]
+
+
+def _courses() -> list[bytes]:
+    """Waypoint files of both versions with commands of all kinds, and plans."""
+    rows = [f"{i}\t0\t3\t{command}\t1\t0\t0\t0\t48.01\t11.0\t60\t1" for i, command in enumerate(COMMANDS)]
+    text = "\n".join(["0\t1\t0\t16\t0\t0\t0\t0\t48.0\t11.0\t500\t1", "# a comment", *rows])
+    old = (
+        '{"type":"missionItem","command":16,"frame":3,"param1":0,"param2":0,"param3":0,"param4":0,"coordinate":[1,2,3]}'
+    )
+    mission = f'{{"plannedHomePosition":{{"coordinate":[48.0,11.0,500]}},"items":[{old}]}}'
+    return [*(f"QGC WPL {version}\n{text}".encode() for version in (110, 120)), mission.encode(), *_missions()]
+
+
+def _kml() -> list[bytes]:
+    """A KML in two encodings, and as an archive."""
+    ring = "<LinearRing><coordinates>14.3,48.1,0 14.4,48.1,0 14.4,48.2,0</coordinates></LinearRing>"
+    body = f"<Polygon><outerBoundaryIs>{ring}</outerBoundaryIs></Polygon><Point><coordinates>1,2</coordinates></Point>"
+    track = "<gx:Track><gx:coord>14.3 48.1 300</gx:coord><gx:coord>14.4 48.2 300</gx:coord></gx:Track>"
+    head = (
+        '<?xml version="1.0" encoding="{}"?><kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://g"><Document>'
+    )
+    documents = [
+        (head.format(name) + body + track + "</Document></kml>").encode(name)
+        for name in ("UTF-8", "UTF-16", "ISO-8859-1")
+    ]
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("doc.kml", documents[0])
+    return [*documents, archive.getvalue()]
+
+
+@cache
+def _tile_files() -> list[bytes]:
+    """A small MBTiles file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "t.mbtiles"
+        db = sqlite3.connect(path)
+        db.execute("PRAGMA page_size = 512")
+        db.execute("CREATE TABLE metadata (name TEXT, value TEXT)")
+        db.execute("CREATE TABLE tiles (zoom_level INT, tile_column INT, tile_row INT, tile_data BLOB)")
+        db.executemany("INSERT INTO metadata VALUES (?, ?)", [("bounds", "14.3,48.1,14.4,48.2"), ("scheme", "xyz")])
+        db.executemany("INSERT INTO tiles VALUES (10, 552, ?, ?)", [(355, b"one"), (356, b"two")])
+        db.commit()
+        db.close()
+        return [path.read_bytes()]
+
+
+def _read_tiles(path: Path) -> None:
+    reader = MbtilesReader(path)
+    try:
+        for row in (355, 356):
+            reader.get(Tile(10, 552, row))
+        reader.first(reader.zooms[-1])
+    finally:
+        reader.close()
+
+
+@cache
+def _elevations() -> list[bytes]:
+    """Small elevation models: feet by unit, by vertical system, with scale and offset."""
+    import rasterio
+    from rasterio.transform import Affine
+
+    profile = {"driver": "GTiff", "width": 8, "height": 8, "count": 1, "transform": Affine(10, 0, 3e5, 0, -10, 5e6)}
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "d.tif"
+        for crs, unit, scale in (("EPSG:32632", "US survey foot", 0.1), ("EPSG:32632+6360", "", 1.0)):
+            with rasterio.open(path, "w", crs=crs, dtype="int16", nodata=-99, **profile) as file:
+                file.write(np.full((1, 8, 8), 500, np.int16))
+                file.scales, file.offsets, file.units = (scale,), (10.0,), (unit,)
+            found.append(path.read_bytes())
+    return found
+
+
+def _read_elevation(path: Path) -> None:
+    with open_raster(path) as file:
+        heights = heights_of(file, str(path))
+        height_statement(file, path, heights, crs_of(file, path), (3e5, 5e6))
+
+
+def _start(data: bytes) -> None:
+    parse_start(data.decode("utf-8", "replace"))
+
+
+def _image(data: bytes) -> None:
+    for by in (1, 2):
+        decode_image(data, WIDTH, HEIGHT, by)
+
+
+TARGETS: tuple[Target, ...] = (
+    Target("mavlink", lambda: _telemetry()[0], _receive),
+    Target("telemetry log", lambda: _telemetry()[1], _in_file(".tlog", _read_log)),
+    Target("configuration", _configs, _in_file(".toml", lambda path: load_config([path]))),
+    Target("description", _descriptions, _in_file(".toml", read_description)),
+    Target("frames.csv", _tables, _in_file(".csv", lambda path: read_table(path, "frames.csv", with_file=True))),
+    Target("image", _images, _image),
+    Target("photo", _images, _in_file(".jpg", read_info)),
+    Target("stream", _streams, _stream),
+    Target("record", _records, _in_file(".mcap", _read_record)),
+    Target("map", _maps, _in_file(".gpkg", _read_map)),
+    Target("mission", _missions, _in_file(".waypoints", read_mission)),
+    Target("plan", _missions, _in_file(".plan", read_mission)),
+    Target("course", _courses, _in_file(".waypoints", lambda path: read_mission(path, course_only=True))),
+    Target("area", _kml, _in_file(".kml", lambda path: read_area(str(path), corridor_km=1.0))),
+    Target("tile file", _tile_files, _in_file(".mbtiles", _read_tiles)),
+    Target("elevation", _elevations, _in_file(".tif", _read_elevation)),
+    Target("autopilot log", lambda: _telemetry()[1], _in_file(".tlog", read_autopilot_log)),
+    Target("start", lambda: [b"48.1,11.2"], _start),
+)
+
+
+def refused_or_read(target: Target, data: bytes) -> None:
+    """Runs a target. Raises what is a bug."""
+    with suppress(TerrafixError):
+        target.run(data)
