@@ -11,6 +11,7 @@ from typing import Any
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
+from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 
 from terrafix.core.errors import MapError
@@ -39,9 +40,10 @@ def crs_of(dataset: Any, path: Path) -> CRS:
     ``check_datum``."""
     if dataset.transform == Affine.identity():
         raise MapError(f"{path}: {_without_transform(dataset, path)}")
-    if dataset.crs is None:
+    stated = stated_crs(dataset, path)
+    if stated is None:
         raise MapError(f"{path}: has no coordinate system; add it with gdal_translate -a_srs EPSG:nnnnn IN OUT")
-    crs = _horizontal(CRS.from_wkt(dataset.crs.to_wkt()))
+    crs = _horizontal(stated)
     authority = dataset.crs.to_authority()  # by the file, or a guess of 70 % and more
     if authority:
         listed = _horizontal(CRS.from_authority(*authority))
@@ -54,10 +56,23 @@ def crs_of(dataset: Any, path: Path) -> CRS:
     return crs
 
 
+def stated_crs(dataset: Any, path: Path) -> CRS | None:
+    """The coordinate system that a raster names, as it names it; None: none. Raises MapError: damaged."""
+    try:
+        return None if dataset.crs is None else CRS.from_wkt(dataset.crs.to_wkt())
+    except (UnicodeDecodeError, ProjError, RasterioError) as error:
+        raise MapError(
+            f"{path}: its coordinate system cannot be read ({error}); set it with gdal_translate -a_srs EPSG:nnnnn"
+        ) from None
+
+
 def check_datum(dataset: Any, path: Path) -> tuple[str, ...]:
     """What is assumed about the datum that the file itself names. Raises MapError: not named, or without a known way to
     WGS 84, and on an ellipsoid whose datums are hundreds of metres apart."""
-    crs = _horizontal(CRS.from_wkt(dataset.crs.to_wkt()))
+    stated = stated_crs(dataset, path)
+    if stated is None:
+        return ()
+    crs = _horizontal(stated)
     base = (crs.source_crs if crs.is_bound else None) or crs
     named = bool(base.datum) and not UNNAMED.search(_datum_name(base))
     shift = list(crs.coordinate_operation.towgs84) if crs.is_bound and crs.coordinate_operation else []
@@ -166,10 +181,12 @@ def _without_transform(dataset: Any, path: Path) -> str:
     """What is missing, and the command that helps, for a raster without a geotransform."""
     points, points_crs = dataset.gcps
     if points and points_crs is not None:
-        to_wgs84 = Transformer.from_crs(CRS.from_wkt(points_crs.to_wkt()), 4326, always_xy=True)
-        lon_deg, lat_deg = to_wgs84.transform(
-            sum(point.x for point in points) / len(points), sum(point.y for point in points) / len(points)
-        )
+        x, y = (sum(values) / len(points) for values in zip(*((p.x, p.y) for p in points), strict=True))
+        try:
+            to_wgs84 = Transformer.from_crs(CRS.from_wkt(points_crs.to_wkt()), 4326, always_xy=True)
+            lon_deg, lat_deg = to_wgs84.transform(x, y)
+        except (UnicodeDecodeError, ProjError, RasterioError):
+            return "is placed by ground control points in a coordinate system that cannot be read; set -a_srs again"
         warp = f"gdalwarp -tps -r bilinear -t_srs EPSG:{_zone(lon_deg, lat_deg)} {path} OUT.tif"
         return f"is placed by {len(points)} ground control points only; warp it with: {warp}"
     if points:

@@ -284,7 +284,7 @@ def open_raster(path: Path) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)  # reported below as an error
             return rasterio.open(path)
-    except RasterioError:
+    except (RasterioError, UnicodeDecodeError):  # GDAL's message may quote the bytes of a damaged file
         raise MapError(f"{path}: not an image that GDAL can read; give a GeoTIFF") from None
 
 

@@ -16,7 +16,7 @@ from pyproj.database import get_units_map
 
 from terrafix.core.errors import MapError
 from terrafix.map.format import InputStatement
-from terrafix_tools.mapping.datum import accuracy_to_wgs84, check_datum
+from terrafix_tools.mapping.datum import accuracy_to_wgs84, check_datum, stated_crs
 from terrafix_tools.mapping.package.height_datums import Datum, Unit
 
 US_FOOT, FOOT, METRE = "US survey foot", "foot", "metre"
@@ -61,11 +61,14 @@ def heights_of(file: Any, where: str, unit: Unit | None = None, stated: Datum | 
     scale, offset = float(file.scales[0]), float(file.offsets[0])
     if not (math.isfinite(scale) and math.isfinite(offset)) or scale == 0.0:
         raise MapError(f"{where}: scale {scale:g} and offset {offset:g} of its band are no numbers; set them again")
-    crs = None if file.crs is None else CRS.from_wkt(file.crs.to_wkt())
+    crs = stated_crs(file, Path(where))
     vertical = _vertical(crs)
     axis = vertical.axis_info[-1] if vertical else crs.axis_info[2] if crs and len(crs.axis_info) == 3 else None
     assumed: list[str] = []
-    band = (file.units[0] or "").strip()
+    try:
+        band = (file.units[0] or "").strip()
+    except UnicodeDecodeError:
+        raise MapError(f"{where}: the unit of its heights is no text; give --dem-unit m, ft or us-ft") from None
     if unit is not None:
         name, unit_m = OF_UNIT[unit], _metres(OF_UNIT[unit])
         assert unit_m is not None

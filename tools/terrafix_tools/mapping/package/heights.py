@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from pyproj import CRS, Transformer
+from pyproj import Transformer
 from pyproj.exceptions import ProjError
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix_tools.mapping.datum import crs_of, lacking_grids, operations
+from terrafix_tools.mapping.datum import crs_of, lacking_grids, operations, stated_crs
 from terrafix_tools.mapping.mosaic.warp import NODE_PX, spread
 from terrafix_tools.mapping.package.height_datums import Datum, Unit
 from terrafix_tools.mapping.package.height_values import Heights, heights_of
@@ -68,8 +68,9 @@ def _from_national(dem: Path, heights: Heights, out: Path) -> tuple[Path, str]:
     """Conversion by the operation that PROJ knows best, if it has its grids."""
     name = heights.datum_name
     with open_raster(dem) as file:
-        stated, horizontal = CRS.from_wkt(file.crs.to_wkt()), crs_of(file, dem)
+        stated, horizontal = stated_crs(file, dem), crs_of(file, dem)
         x, y = file.transform @ (file.width / 2, file.height / 2)
+    assert stated is not None  # crs_of has read it
     group = operations(stated, WGS84_EGM96, *Transformer.from_crs(horizontal, 4326, always_xy=True).transform(x, y))
     if group.transformers and group.best_available:
         change = group.transformers[0]

@@ -27,6 +27,8 @@ from terrafix.core.errors import MapError
 from terrafix_tools.mapping.sources.tiles.grid import MAX_ZOOM, Tile
 from terrafix_tools.mapping.sources.tiles.store import mbtiles_row
 
+# SQLite's message about a damaged file may quote its bytes, which then are not valid UTF-8.
+DATABASE_ERRORS = (sqlite3.DatabaseError, UnicodeDecodeError)
 PICTURES = (TileType.PNG, TileType.JPEG, TileType.WEBP)
 DIRECTORIES = 64  # decompressed directories of a PMTiles file in the cache
 HEADER_BYTES = 127
@@ -44,7 +46,7 @@ class MbtilesReader:
             self._db = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)
             self._close = weakref.finalize(self, self._db.close)  # also of a file that is refused below
             rows = self._db.execute("SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level").fetchall()
-        except sqlite3.DatabaseError as error:
+        except DATABASE_ERRORS as error:
             raise MapError(f"{path}: not an MBTiles file ({error}); check the source") from None
         self.zooms = [row[0] for row in rows]
         if not self.zooms:
@@ -62,7 +64,7 @@ class MbtilesReader:
         try:
             low, high = self._db.execute(query, (zoom,)).fetchone()
             metadata = self._metadata()
-        except sqlite3.DatabaseError as error:
+        except DATABASE_ERRORS as error:
             raise MapError(f"{self.path}: damaged ({error}); copy or download it again") from None
         if not isinstance(low, int) or not isinstance(high, int) or not 0 <= low <= high < 1 << zoom:
             raise MapError(f"{self.path}: a row of its tiles is none of zoom {zoom}; check the source")
@@ -89,7 +91,7 @@ class MbtilesReader:
         try:
             row = tile.row if self.from_north else mbtiles_row(tile.zoom, tile.row)
             found = self._db.execute(query, (tile.zoom, tile.column, row)).fetchone()
-        except sqlite3.DatabaseError as error:
+        except DATABASE_ERRORS as error:
             raise MapError(f"{self.path}: damaged near tile {tile} ({error}); copy or download it again") from None
         return found[0] if found else None
 
@@ -98,7 +100,7 @@ class MbtilesReader:
         query = "SELECT CAST(tile_data AS BLOB) FROM tiles WHERE zoom_level = ? AND length(tile_data) > 0 LIMIT 1"
         try:
             found = self._db.execute(query, (zoom,)).fetchone()
-        except sqlite3.DatabaseError as error:
+        except DATABASE_ERRORS as error:
             raise MapError(f"{self.path}: damaged ({error}); copy or download it again") from None
         return bytes(found[0]) if found else b""
 
