@@ -164,11 +164,14 @@ def ensure_package(
     cached = cache_dir / f"{path.stem}-{key.hexdigest()[:16]}.gpkg"
     if cached.is_file():
         try:
-            MapPackage.open(cached).close()
+            opened = MapPackage.open(cached)
         except MapError:
             pass  # the cached file is damaged and is built again
         else:
-            return cached
+            says_what_was_read = bool(opened.manifest.inputs)  # else by a version that read units and datums otherwise
+            opened.close()
+            if says_what_was_read:
+                return cached
     return build(path, cached, dem=dem, date=date, licence=licence, progress=progress)
 
 

@@ -83,7 +83,9 @@ def check_datum(dataset: Any, path: Path) -> tuple[str, ...]:
         return ()
     ellipsoid = base.ellipsoid
     if ellipsoid is None or not _is_earth_centred(ellipsoid):
-        what = f"its datum '{_datum_name(base)}' has no known way to WGS 84" if named else "does not name its datum"
+        what = (
+            f"its datum '{_datum_name(base)}' has no known way to WGS 84 here" if named else "does not name its datum"
+        )
         raise MapError(
             f"{path}: {what} (ellipsoid {ellipsoid.name if ellipsoid else 'unknown'}), which may be hundreds of metres "
             "off; state its coordinate system with gdal_translate -a_srs EPSG:nnnnn IN OUT"

@@ -1,6 +1,7 @@
 """Elevation in the units and datums of the world: a plane of known height, written by GDAL, with PROJ's units."""
 
 import dataclasses
+import io
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -179,8 +180,11 @@ def test_a_stated_unit_and_datum_count_and_are_in_the_manifest(tmp_path: Path, o
 
 
 def test_what_is_assumed_of_a_plain_file_is_in_the_manifest_and_in_map_check(tmp_path: Path, ortho: Path) -> None:
-    package = ordered(ortho, write_dem(tmp_path / "d.tif"))
+    printed = io.StringIO()
+    said = Console(file=printed, soft_wrap=True)
+    package = ordered(ortho, write_dem(tmp_path / "d.tif"), say=said)
     line = elevation_line(package)
+    assert line in printed.getvalue()
     assert "unit of heights not stated: metres" in line and "vertical datum not stated: EGM96" in line
     shown = CliRunner().invoke(app, ["map", "check", str(package.path)], catch_exceptions=False).output
     assert line in " ".join(shown.split())
