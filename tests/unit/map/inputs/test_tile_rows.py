@@ -58,9 +58,9 @@ def levels(reader: MbtilesReader, first: Tile) -> list[int]:
     found = []
     for down in range(SIDE):
         data = reader.get(Tile(ZOOM, first.column, first.row + down))
-        found.append(
-            -1 if data is None else int(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[0, 0, 0])
-        )
+        picture = np.full((1, 1), -1) if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), 0)
+        assert picture is not None
+        found.append(int(picture[0, 0]))
     reader.close()
     return found
 
