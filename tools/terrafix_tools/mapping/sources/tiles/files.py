@@ -27,8 +27,9 @@ from terrafix.core.errors import MapError
 from terrafix_tools.mapping.sources.tiles.grid import MAX_ZOOM, Tile
 from terrafix_tools.mapping.sources.tiles.store import mbtiles_row
 
-# SQLite's message about a damaged file may quote its bytes, which then are not valid UTF-8.
-DATABASE_ERRORS = (sqlite3.DatabaseError, UnicodeDecodeError)
+# SQLite's message about a damaged file may quote its bytes, which then are not valid UTF-8; a length in it may be more
+# than there is memory.
+DATABASE_ERRORS = (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError)
 PICTURES = (TileType.PNG, TileType.JPEG, TileType.WEBP)
 DIRECTORIES = 64  # decompressed directories of a PMTiles file in the cache
 HEADER_BYTES = 127
