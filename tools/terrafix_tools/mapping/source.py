@@ -22,8 +22,9 @@ from rasterio.windows import Window
 
 from terrafix.core.errors import MapError
 from terrafix.map.format import InputStatement
-from terrafix_tools.mapping.datum import accuracy_to_wgs84, check_datum, crs_of
+from terrafix_tools.mapping.datum import check_datum, crs_of
 from terrafix_tools.mapping.sources.utm import utm_epsg
+from terrafix_tools.mapping.ways import accuracy_to_wgs84
 
 NODATA = re.compile("<NoDataValue>([^<]*)</NoDataValue>")
 SAMPLE_PX = 1024  # side of the downsampled image that determines the value range of deep pixels

@@ -7,7 +7,7 @@ import msgspec
 from terrafix.core.config import Map
 from terrafix.map.format import Ce90Origin, InputStatement
 from terrafix.map.package import MapPackage
-from terrafix_tools.mapping.datum import way_to_wgs84
+from terrafix_tools.mapping.ways import way_to_wgs84
 
 IMAGERY = "imagery"
 

@@ -27,8 +27,7 @@ from terrafix_lab.sim.ground.draped_image import open_ground
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.area.build import Order, build_order
 from terrafix_tools.mapping.build import build
-from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
-from terrafix_tools.mapping.package.height_datums import Datum, Unit
+from terrafix_tools.mapping.choices import Datum, Descriptors, Unit
 
 CENTRE = (300_150.0, 2_599_850.0)  # of the imagery, EPSG:32651
 HIGH_M, SLOPE = 1600.0, 0.02

@@ -17,13 +17,12 @@ from terrafix_tools.mapping.area.checks import check_area
 from terrafix_tools.mapping.area.files import DEFAULT_BUFFER_KM, is_line, read_area
 from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.build import build_package, layer_of
+from terrafix_tools.mapping.choices import Datum, Descriptors, Unit
 from terrafix_tools.mapping.datum import crs_of
 from terrafix_tools.mapping.fetching.progress import shown
 from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
 from terrafix_tools.mapping.orthomosaic.write import read_statement
 from terrafix_tools.mapping.package.dem import DemSource
-from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
-from terrafix_tools.mapping.package.height_datums import Datum, Unit
 from terrafix_tools.mapping.package.height_values import height_statement, heights_of
 from terrafix_tools.mapping.package.heights import to_amsl
 from terrafix_tools.mapping.source import open_raster

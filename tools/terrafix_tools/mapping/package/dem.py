@@ -18,10 +18,10 @@ from rasterio.windows import Window
 
 from terrafix.core.errors import MapError
 from terrafix.map.format import DEM_NULL, DEM_TILE_PX, DemGrid, Level
+from terrafix_tools.mapping.choices import Datum, Unit
 from terrafix_tools.mapping.datum import crs_of
 from terrafix_tools.mapping.layers import Bounds, Elevation, ElevationInput
 from terrafix_tools.mapping.package.gpkg import GpkgWriter
-from terrafix_tools.mapping.package.height_datums import Datum, Unit
 from terrafix_tools.mapping.package.height_values import check_amsl, height_statement, heights_of
 from terrafix_tools.mapping.package.pyramid import Place
 from terrafix_tools.mapping.source import SAMPLE_PX, ground_distance_m, ground_pixel_m, holds, open_raster

@@ -16,8 +16,9 @@ from pyproj.database import get_units_map
 
 from terrafix.core.errors import MapError
 from terrafix.map.format import InputStatement
-from terrafix_tools.mapping.datum import accuracy_to_wgs84, check_datum, stated_crs
-from terrafix_tools.mapping.package.height_datums import Datum, Unit
+from terrafix_tools.mapping.choices import Datum, Unit
+from terrafix_tools.mapping.datum import check_datum, stated_crs
+from terrafix_tools.mapping.ways import accuracy_to_wgs84
 
 US_FOOT, FOOT, METRE = "US survey foot", "foot", "metre"
 SHORT = {  # letters of a unit as programs write it -> its name in PROJ's database

@@ -16,11 +16,12 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix_tools.mapping.datum import crs_of, lacking_grids, operations, stated_crs
+from terrafix_tools.mapping.choices import Datum, Unit
+from terrafix_tools.mapping.datum import crs_of, stated_crs
 from terrafix_tools.mapping.mosaic.warp import NODE_PX, spread
-from terrafix_tools.mapping.package.height_datums import Datum, Unit
 from terrafix_tools.mapping.package.height_values import Heights, heights_of
 from terrafix_tools.mapping.source import open_raster
+from terrafix_tools.mapping.ways import lacking_grids, operations
 
 BLOCK_PX = 1024
 WGS84_EGM96 = 9707  # EPSG: WGS 84 + EGM96 height
