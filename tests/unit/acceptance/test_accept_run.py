@@ -18,9 +18,10 @@ from terrafix_tools.accept.false_inputs.scenarios import LIES
 from terrafix_tools.accept.fly import Job, Point, Result
 from terrafix_tools.accept.measuring.criteria import EVERYWHERE, unmeasured
 from terrafix_tools.accept.measuring.results import JudgedRow, Marks, Span, Verdict
+from terrafix_tools.accept.page import write
 from terrafix_tools.accept.run import AcceptOptions, accept, truth_of
 from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
-from terrafix_tools.accept.table import conclude, headline, markdown, write
+from terrafix_tools.accept.table import conclude, headline, markdown
 
 
 def row(verdict: Verdict, **more: object) -> JudgedRow:

@@ -1,21 +1,36 @@
 """acceptance.html: one self-contained page. Failed rows come first."""
 
+import json
 from html import escape
-from importlib.resources import files
-from typing import TYPE_CHECKING
+from pathlib import Path
+
+import msgspec
 
 from terrafix_tools.accept.fly import Result
 from terrafix_tools.accept.measuring.results import BROKEN, JudgedRow, Verdict, with_unit
-from terrafix_tools.report.charts import Chart, spans_of
-
-if TYPE_CHECKING:
-    from terrafix_tools.accept.table import Acceptance
+from terrafix_tools.accept.table import NAME, Acceptance, markdown
+from terrafix_tools.pages.charts import Chart, spans_of
+from terrafix_tools.pages.document import (
+    Figure,
+    Html,
+    document,
+    figures,
+    folded,
+    header,
+    legend,
+    scroll,
+    section,
+    table,
+    write_file,
+)
 
 ERROR_FLOOR_M = 0.5  # of the logarithmic axis
 ERROR_TOP_M = 2000.0  # the same for all charts, to compare them
 WIDTH, HEIGHT = 400, 190  # of one chart, in its own units
 STRIP = 6  # height of the source labels under the chart
 WORDS = {"satellite_anchored": "map match", "visual_propagated": "odometry", "dead_reckoned": "dead reckoning"}
+KEYS = [("k-ink", "error"), ("k-claim", "claimed 95 % radius"), ("k-sat", "map match"), ("k-vis", "odometry")]
+KEYS += [("k-dead", "dead reckoning"), ("k-none", "no position")]
 MARKS = {
     Verdict.PASS: ("good", "holds"),
     Verdict.BELOW: ("bad", "below floor"),
@@ -24,28 +39,34 @@ MARKS = {
 }
 
 
-def page(acceptance: "Acceptance") -> str:
+def write(acceptance: Acceptance, out: Path) -> None:
+    """acceptance.json, acceptance.md, acceptance.html. Raises OutputError."""
+    text = {
+        "json": json.dumps(msgspec.to_builtins(acceptance), indent=1, allow_nan=False) + "\n",
+        "md": markdown(acceptance),
+        "html": page(acceptance),
+    }
+    for suffix, content in text.items():
+        write_file(out / f"{NAME}.{suffix}", content, "; choose another --out")
+
+
+def page(acceptance: Acceptance) -> str:
     """The whole document."""
-    assets = files("terrafix_tools") / "assets"
-    style = "".join((assets / name).read_text(encoding="utf-8") for name in ("report.css", "acceptance.css"))
     flown = [result for result in acceptance.results if result.points]
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>Acceptance: {escape(acceptance.flight)}</title><style>{style}</style></head><body><main>"
-        f"{_head(acceptance)}{_broken(acceptance)}{_matrix(acceptance)}{_pictures(flown)}{_rows(acceptance)}"
-        "</main></body></html>\n"
+    return document(
+        f"Acceptance: {acceptance.flight}",
+        f"{_head(acceptance)}{_broken(acceptance)}{_matrix(acceptance)}{_pictures(flown)}{_rows(acceptance)}",
     )
 
 
-def _head(acceptance: "Acceptance") -> str:
+def _head(acceptance: Acceptance) -> str:
     counts = {verdict: sum(row.verdict is verdict for row in acceptance.rows) for verdict in Verdict}
-    figures = [
-        (str(sum(bool(r.points) for r in acceptance.results)), "scenarios flown", ""),
-        (str(counts[Verdict.PASS]), "rows hold their floor", "good"),
-        (str(counts[Verdict.BELOW]), "rows below their floor", "bad" if counts[Verdict.BELOW] else ""),
-        (str(counts[Verdict.NOT_BUILT]), "rows not built", "bad" if counts[Verdict.NOT_BUILT] else ""),
-        (str(counts[Verdict.NOT_MEASURABLE]), "rows not measurable here", ""),
+    shown = [
+        Figure(str(sum(bool(r.points) for r in acceptance.results)), "", "scenarios flown"),
+        Figure(str(counts[Verdict.PASS]), "", "rows hold their floor", "good"),
+        Figure(str(counts[Verdict.BELOW]), "", "rows below their floor", "bad" if counts[Verdict.BELOW] else ""),
+        Figure(str(counts[Verdict.NOT_BUILT]), "", "rows not built", "bad" if counts[Verdict.NOT_BUILT] else ""),
+        Figure(str(counts[Verdict.NOT_MEASURABLE]), "", "rows not measurable here"),
     ]
     machine = acceptance.machine
     facts = [
@@ -55,15 +76,11 @@ def _head(acceptance: "Acceptance") -> str:
         f"{machine['cpu']}, {machine['cores']} cores",
         f"terrafix {machine['versions'].get('terrafix', '')}",
     ]
-    cells = "".join(f'<div><b class="{css}">{value}</b><span>{text}</span></div>' for value, text, css in figures)
-    return (
-        f"<header><h1>Acceptance</h1><p>{escape(acceptance.flight)}</p>"
-        f"<p>{escape(' · '.join(fact for fact in facts if fact))}</p></header>"
-        f'<div class="figures wide">{cells}</div>'
-    )
+    line = " · ".join(fact for fact in facts if fact)
+    return header("", "Acceptance", acceptance.flight, line) + figures(shown)
 
 
-def _broken(acceptance: "Acceptance") -> str:
+def _broken(acceptance: Acceptance) -> str:
     rows = [row for row in acceptance.rows if row.verdict in BROKEN]
     if not rows:
         return "<h2>Every floor that was measured holds</h2>"
@@ -87,7 +104,7 @@ def _number(row: JudgedRow) -> str:
     )
 
 
-def _matrix(acceptance: "Acceptance") -> str:
+def _matrix(acceptance: Acceptance) -> str:
     """Scenarios down, requirements across; a cell shows its worst row."""
     columns = sorted({row.ac for row in acceptance.rows}, key=lambda ac: (ac[:2], int(ac.split("-")[1])))
     names = list(dict.fromkeys(row.scenario for row in acceptance.rows))
@@ -98,10 +115,11 @@ def _matrix(acceptance: "Acceptance") -> str:
             _cell([row for row in acceptance.rows if row.scenario == name and row.ac == ac]) for ac in columns
         )
         body += f"<tr><th>{escape(name)}</th>{cells}</tr>"
-    return (
-        '<h2>Scenarios and requirements</h2><p class="lead">Green holds its floor, red does not, grey could not be '
-        "measured here. A cell shows the worst of its rows; point at it for all of them.</p>"
-        f'<div class="scroll"><table class="matrix"><tr><th></th>{head}</tr>{body}</table></div>'
+    return section(
+        "Scenarios and requirements",
+        "Green holds its floor, red does not, grey could not be measured here. A cell shows the worst of its rows; "
+        "point at it for all of them.",
+        scroll(f'<table class="matrix"><tr><th></th>{head}</tr>{body}</table>'),
     )
 
 
@@ -119,16 +137,11 @@ def _cell(rows: list[JudgedRow]) -> str:
 
 
 def _pictures(results: list[Result]) -> str:
-    figures = "".join(_picture(result) for result in results)
-    return (
-        "<h2>Error and claim, scenario by scenario</h2>"
-        '<p class="lead">The line is the error, the shaded area the claimed 95 % radius: a consistent covariance '
-        "covers the line. Grey: a fault. Below each picture, where the position came from.</p>"
-        f'<div class="multiples">{figures}</div><div class="legend">'
-        '<span><i class="key k-ink"></i> error</span><span><i class="key k-claim"></i> claimed 95 % radius</span>'
-        '<span><i class="key k-sat"></i> map match</span><span><i class="key k-vis"></i> odometry</span>'
-        '<span><i class="key k-dead"></i> dead reckoning</span><span><i class="key k-none"></i> no position</span>'
-        "</div>"
+    return section(
+        "Error and claim, scenario by scenario",
+        "The line is the error, the shaded area the claimed 95 % radius: a consistent covariance covers the line. "
+        "Grey: a fault. Below each picture, where the position came from.",
+        f'<div class="multiples">{"".join(map(_picture, results))}</div>{legend(KEYS)}',
     )
 
 
@@ -156,16 +169,11 @@ def _picture(result: Result) -> str:
     )
 
 
-def _rows(acceptance: "Acceptance") -> str:
-    body = "".join(
-        f"<tr><td>{escape(row.scenario)}</td><td>{row.ac}</td><td>{escape(row.what)}</td>"
-        f"<td>{escape(with_unit(row.measured, row.unit))}</td><td>{escape(row.floor)}</td><td>{escape(row.goal)}</td>"
-        f'<td class="{MARKS[row.verdict][0]}">{row.verdict}{", goal met" if row.goal_met else ""}</td>'
-        f"<td>{escape(row.why)}</td></tr>"
-        for row in acceptance.rows
-    )
-    head = "".join(f"<th>{t}</th>" for t in ("scenario", "row", "what", "measured", "floor", "goal", "verdict", ""))
-    return (
-        f'<details><summary>All {len(acceptance.rows)} rows</summary><div class="scroll">'
-        f'<table class="rows"><tr>{head}</tr>{body}</table></div></details>'
-    )
+def _rows(acceptance: Acceptance) -> str:
+    columns = ("scenario", "row", "what", "measured", "floor", "goal", "verdict", "")
+    rows = []
+    for row in acceptance.rows:
+        verdict = f'<span class="{MARKS[row.verdict][0]}">{row.verdict}{", goal met" if row.goal_met else ""}</span>'
+        measured = with_unit(row.measured, row.unit)
+        rows.append([row.scenario, row.ac, row.what, measured, row.floor, row.goal, Html(verdict), row.why])
+    return folded(f"All {len(rows)} rows", table(columns, rows, css="rows"))

@@ -19,9 +19,10 @@ from terrafix_tools.accept.false_inputs.scenarios import LIES, LIES_IN_THE_LOOP
 from terrafix_tools.accept.fly import RESULT, Job, Result
 from terrafix_tools.accept.measuring.criteria import failed, unmeasured
 from terrafix_tools.accept.measuring.results import BROKEN, with_unit
+from terrafix_tools.accept.page import write
 from terrafix_tools.accept.plan import CLOSED_LOOP, Scenario
 from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
-from terrafix_tools.accept.table import Acceptance, conclude, write
+from terrafix_tools.accept.table import Acceptance, conclude
 
 JOB, GROUND_JOB, CRASH = "job.json", "ground.json", "crash.txt"
 QUICK_FRAMES = 120

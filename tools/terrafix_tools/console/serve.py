@@ -18,7 +18,7 @@ from terrafix_tools.console.app import make_app
 from terrafix_tools.console.connections import BoundedProtocol
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.settings import Settings
-from terrafix_tools.parallel.pool import check_scheduler
+from terrafix_tools.parallel.scheduler import check_scheduler
 
 KEEP_ALIVE_S = 15  # idle connections are closed after this time
 STOP_S = 10  # longest wait for requests in progress at a stop

@@ -2,13 +2,12 @@
 
 import json
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 
-from terrafix.core.errors import OutputError
 from terrafix_tools.estimates import Row
 from terrafix_tools.flight_map import map_of_flight
-from terrafix_tools.report.charts import clock
+from terrafix_tools.pages.charts import clock, stamp
+from terrafix_tools.pages.document import asset, document, figures, header, section, timeline, write_file
 from terrafix_tools.report.data import FlightView, radius95_m
 from terrafix_tools.report.gather import gather
 from terrafix_tools.report.map_picture import map_svg
@@ -20,11 +19,11 @@ from terrafix_tools.report.sections_gnss import gnss
 from terrafix_tools.report.sections_innovations import innovations
 from terrafix_tools.report.sections_moments import moments_sections
 from terrafix_tools.report.sections_run import camera_images, finalised, picture_rows, provenance, timing
-from terrafix_tools.report.text import events, figures, stamp
+from terrafix_tools.report.text import events
+from terrafix_tools.report.text import figures as key_figures
 
 NAME = "report.html"
 MAX_POINTED = 2500  # frames that the pointer finds on the map and in the charts; of a longer flight, evenly spread ones
-MAX_IN_ROW = 7  # number of figures in one row; more are set in two even rows
 
 
 def report(folder: Path, truth_path: Path | None = None, map_path: Path | None = None) -> Path:
@@ -34,14 +33,8 @@ def report(folder: Path, truth_path: Path | None = None, map_path: Path | None =
     """
     view = gather(folder, truth_path)
     page = _page(view, map_of_flight(folder, map_path, view.summary, view.header))
-    target = folder / NAME
-    partial = folder / (NAME + ".partial")
-    try:
-        partial.write_text(page, encoding="utf-8")
-        partial.replace(target)
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written ({error.strerror})") from None
-    return target
+    write_file(folder / NAME, page)
+    return folder / NAME
 
 
 def _page(view: FlightView, map_path: Path | None) -> str:
@@ -68,16 +61,11 @@ def _page(view: FlightView, map_path: Path | None) -> str:
     ]
     tips = [{"i": i, "t": round(view.rows[i].t_s, 3), "h": _tip(view, view.rows[i])} for i in pointed]
     data = json.dumps(tips).replace("</", "<\\/")
-    assets = files("terrafix_tools") / "assets"
-    style = (assets / "report.css").read_text(encoding="utf-8")
-    script = (assets / "report.js").read_text(encoding="utf-8")
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{escape(view.title)} - flight report</title><style>{style}</style></head><body><main>"
-        f'{_head(view)}{"".join(sections)}</main><div id="tip"></div>'
-        f'<script type="application/json" id="frames">{data}</script><script>{script}</script></body></html>\n'
+    script = (
+        f'<div id="tip"></div><script type="application/json" id="frames">{data}</script>'
+        f"<script>{asset('report.js')}</script>"
     )
+    return document(f"{view.title} - flight report", "".join([*_head(view), *sections]), script)
 
 
 def pointed_rows(view: FlightView, moments: list[Moment]) -> list[int]:
@@ -87,7 +75,7 @@ def pointed_rows(view: FlightView, moments: list[Moment]) -> list[int]:
     return sorted(chosen)
 
 
-def _head(view: FlightView) -> str:
+def _head(view: FlightView) -> tuple[str, str]:
     kind = "live record" if view.live else "replay, unfinished" if view.unfinished else "replay"
     named = view.summary.get("map", {})
     facts = [
@@ -95,18 +83,8 @@ def _head(view: FlightView) -> str:
         f"map {Path(named['source']).stem}" if named.get("source") else "",
         ", ".join(view.summary.get("models", {})) or ("" if view.live else "no learned model"),
     ]
-    shown = figures(view)
-    tiles = "".join(
-        f'<div><b class="{f.mood}">{escape(f.value)}<small>{escape(f.unit)}</small></b>'
-        f"<span>{escape(f.name)}</span></div>"
-        for f in shown
-    )
-    wide = " wide" if len(shown) > MAX_IN_ROW else ""
-    line = " · ".join(escape(fact) for fact in facts if fact)
-    return (
-        f'<header><div class="eyebrow">Terrafix flight report, {kind}</div><h1>{escape(view.title)}</h1>'
-        f'<p>{line}</p></header><section class="figures{wide}">{tiles}</section>'
-    )
+    line = " · ".join(fact for fact in facts if fact)
+    return header(f"Terrafix flight report, {kind}", view.title, line), figures(key_figures(view))
 
 
 def _map_section(view: FlightView, map_path: Path | None, moments: list[Moment], pointed: list[int]) -> str:
@@ -140,8 +118,7 @@ def _map_section(view: FlightView, map_path: Path | None, moments: list[Moment],
 
 
 def _events(view: FlightView) -> str:
-    rows = "".join(f"<li><time>{stamp(t)}</time><span>{escape(text)}</span></li>" for t, text in events(view))
-    return f'<h2>Events</h2><ol class="moments">{rows}</ol>'
+    return section("Events", "", timeline((stamp(t), text) for t, text in events(view)))
 
 
 def _tip(view: FlightView, row: Row) -> str:

@@ -3,14 +3,14 @@
 import math
 import re
 from collections import Counter
-from html import escape
 from itertools import pairwise
 from typing import Any
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.report.charts import Band, Chart, Point, clock, strips
+from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
+from terrafix_tools.pages.document import facts, folded, legend, scroll, section, two
 from terrafix_tools.report.data import FlightView
-from terrafix_tools.report.sections import end_s, legend, spans, table
+from terrafix_tools.report.sections import end_s, spans
 from terrafix_tools.report.text import FIX_3D, GAP_S, gps_stats
 
 NUMBER = re.compile(r"\d+(\.\d+)?")  # reasons that differ only in their numbers are counted together
@@ -38,16 +38,16 @@ def link(view: FlightView) -> str:
         states = [(t, "good" if state.connected else "bad") for t, state in view.link_states]
         bands.append(Band("link", spans(states, end, "f-", {"good": "connected", "bad": "not connected"})))
     bands += _flag_bands(view, end)
-    parts = [
-        '<h2>GPS_INPUT and the autopilot</h2><p class="lead">Above what was sent, below what the EKF of the autopilot '
-        "reports of it (its horizontal position and velocity, its attitude, whether any sensor aids it), over the same "
-        f"time. An interval over {1000 * GAP_S:.0f} ms is a gap.</p>",
-        f'<div class="scroll">{strips(bands, end, "Link over time")}',
-    ]
-    if stats is not None:
-        parts += [_accuracies(view, end), _jumps(view, end), _intervals(view, end)]
-    parts += [_ratios(view, end), "</div>", _tables(view), _texts(view)]
-    return "".join(parts)
+    sent = [] if stats is None else [_accuracies(view, end), _jumps(view, end), _intervals(view, end)]
+    return section(
+        "GPS_INPUT and the autopilot",
+        "Above what was sent, below what the EKF of the autopilot reports of it (its horizontal position and velocity, "
+        "its attitude, whether any sensor aids it), over the same time. "
+        f"An interval over {1000 * GAP_S:.0f} ms is a gap.",
+        scroll(strips(bands, end, "Link over time"), *sent, _ratios(view, end)),
+        _tables(view),
+        _texts(view),
+    )
 
 
 def _fixes(view: FlightView) -> list[tuple[float, str]]:
@@ -143,7 +143,7 @@ def _tables(view: FlightView) -> str:
             ("rate", f"{stats.rate_hz:.2f} Hz"),
             ("with a 3D fix", f"{100 * stats.share_3d:.1f} %"),
             ("99 % of intervals below", f"{1000 * stats.interval_p99_s:.0f} ms"),
-            ("longest gap", f"{1000 * stats.longest_s:.0f} ms at {clock(round(max(0.0, stats.longest_at_s)))}"),
+            ("longest gap", f"{1000 * stats.longest_s:.0f} ms at {stamp(stats.longest_at_s)}"),
             ("gaps", str(stats.gaps)),
         ]
         sent += [(f"no 3D fix: {reason}", f"{count}") for reason, count in reasons.most_common(6)]
@@ -159,19 +159,18 @@ def _tables(view: FlightView) -> str:
     peer = [
         (k.replace("_", " "), f"{round(v, 3):g}" if isinstance(v, float) else str(v)) for k, v in _scalars(view.peer)
     ]
-    counted = f"<details><summary>Counted by the autopilot</summary>{table(peer)}</details>" if peer else ""
-    first = f"<div><h3>Sent</h3>{table(sent)}</div>" if sent else ""
-    second = f"<div><h3>Received by the autopilot</h3>{table(used)}{counted}</div>" if used or peer else ""
-    return f'<div class="two" style="margin-top:24px">{first}{second}</div>'
+    counted = folded("Counted by the autopilot", facts(peer)) if peer else ""
+    first = f"<h3>Sent</h3>{facts(sent)}" if sent else ""
+    return two(first, f"<h3>Received by the autopilot</h3>{facts(used)}{counted}" if used or peer else "")
 
 
 def _texts(view: FlightView) -> str:
     if not view.pilot_texts:
         return ""
-    texts = [(clock(round(max(0.0, t))), text.text) for t, text in view.pilot_texts[:MAX_TEXTS]]
+    texts = [(stamp(t), text.text) for t, text in view.pilot_texts[:MAX_TEXTS]]
     count = len(view.pilot_texts)
     shown = f"{count}" if count <= MAX_TEXTS else f"the first {MAX_TEXTS} of {count}"
-    return f"<details><summary>{escape(f'Texts to the pilot ({shown})')}</summary>{table(texts)}</details>"
+    return folded(f"Texts to the pilot ({shown})", facts(texts))
 
 
 def _scalars(peer: dict[str, Any]) -> list[tuple[str, Any]]:

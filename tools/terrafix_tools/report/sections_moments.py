@@ -5,14 +5,14 @@ from html import escape
 from pathlib import Path
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.report.charts import clock
+from terrafix_tools.pages.charts import stamp
+from terrafix_tools.pages.document import facts
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.map_crop import open_map
 from terrafix_tools.report.moment_picture import Pictures, pictures
 from terrafix_tools.report.moment_record import FrameRecord, read_frames, shown_frame
-from terrafix_tools.report.moment_text import facts
+from terrafix_tools.report.moment_text import facts as words_of
 from terrafix_tools.report.moments import Moment
-from terrafix_tools.report.sections import table
 from terrafix_tools.report.sections_run import picture_rows
 
 AROUND_S = 1.0  # `terrafix log show` of a moment: this much before and after it
@@ -32,7 +32,7 @@ def moments_sections(view: FlightView, moments: list[Moment], map_path: Path | N
         return "", ""
     blocks = _blocks(view, moments, [frames[frame_id] for frame_id in shown], frames, map_path)
     items = "".join(
-        f'<li><a href="#moment-{i}"><b>{i}</b></a><time>{_time(moment)}</time>'
+        f'<li><a href="#moment-{i}"><b>{i}</b></a><time>{stamp(moment.t_s)}</time>'
         f'<a href="#moment-{i}">{escape(_headline(moment))}</a></li>'
         for i, moment in enumerate(moments, 1)
     )
@@ -83,10 +83,10 @@ def _block(
     return (
         f'<article class="moment" id="moment-{number}">'
         f'<h3><a href="#worst">{number}</a> {escape(_headline(moment))}</h3>'
-        f'<p class="quiet">{_time(moment)} · {escape(frame)} · '
+        f'<p class="quiet">{stamp(moment.t_s)} · {escape(frame)} · '
         f'<a href="#map" data-i="{moment.row}">on the map</a></p>'
         f"{f'<ul>{reasons}</ul>' if reasons else ''}{_pair(view, shown, drawn)}"
-        f"{table(facts(view, moment, own, shown))}<pre>{escape(_commands(view, moment))}</pre></article>"
+        f"{facts(words_of(view, moment, own, shown))}<pre>{escape(_commands(view, moment))}</pre></article>"
     )
 
 
@@ -128,7 +128,3 @@ def _commands(view: FlightView, moment: Moment) -> str:
 
 def _headline(moment: Moment) -> str:
     return next(iter(moment.reasons.values()))
-
-
-def _time(moment: Moment) -> str:
-    return clock(round(max(0.0, moment.t_s)))
