@@ -39,7 +39,7 @@ GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarr
 # a full disk, or one over its quota
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 # and of the extra `console`
-CONSOLE_PACKAGES = ("fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "python_multipart", "pydantic")
+CONSOLE_PACKAGES = ("fastapi", "starlette", "uvicorn", "sqlalchemy", "python_multipart", "pydantic")
 
 app = typer.Typer(no_args_is_help=True)
 app.add_typer(map_app, name="map")

@@ -12,7 +12,7 @@ from terrafix_tools.console.compute.observed import FrameOutcome
 from terrafix_tools.console.events import EVENTS, Health, ProcessingBlocked, VerdictGiven, name_of
 from terrafix_tools.console.feed import Feed
 from terrafix_tools.console.payloads import FlightState, Fragment, FrameResult, Hint, InputRequest, NewFlight
-from terrafix_tools.console.store import flights, schema
+from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database, open_database
 from terrafix_tools.console.store.flights import StoredEvent
 
@@ -52,17 +52,6 @@ def test_names_of_events_are_those_of_the_contract() -> None:
         "flight_completed",
         "health",
     ]
-
-
-def test_the_migrations_make_the_tables_of_the_schema(database: Database) -> None:
-    import sqlalchemy as sa
-
-    with database.read() as db:
-        made = sa.inspect(db)
-        for table in schema.metadata.sorted_tables:
-            assert {c["name"] for c in made.get_columns(table.name)} == set(table.columns.keys())
-            keys = made.get_pk_constraint(table.name)["constrained_columns"]
-            assert keys == [c.name for c in table.primary_key]
 
 
 def test_a_step_that_is_computed_again_adds_nothing(database: Database) -> None:
