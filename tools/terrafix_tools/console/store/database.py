@@ -49,8 +49,8 @@ class Database:
 
 
 def open_database(folder: Path, *, durable: bool = True) -> Database:
-    """Opens ``folder``/FILE and makes its tables. ``durable``: a commit waits for the disk; else it
-    survives the end of the process, but maybe not a loss of power. Raises OutputError."""
+    """Opens ``folder``/FILE and makes its tables where it has none. ``durable``: a commit waits for the disk; else it survives
+    the end of the process, but maybe not a loss of power. Raises OutputError: no database, or one of another version."""
     file = folder / FILE
     engine = sa.create_engine(f"sqlite:///{file}", connect_args={"check_same_thread": False, "timeout": BUSY_MS / 1e3})
 
@@ -67,14 +67,21 @@ def open_database(folder: Path, *, durable: bool = True) -> Database:
     sa.event.listen(engine, "connect", settings)
     try:
         with engine.connect() as connection:
-            connection.exec_driver_sql("BEGIN IMMEDIATE")  # another process may open it now
-            if connection.exec_driver_sql("PRAGMA user_version").scalar() == 0:
-                schema.metadata.create_all(connection)
+            version = connection.exec_driver_sql("PRAGMA user_version").scalar()
+            if version == 0:
+                connection.exec_driver_sql("BEGIN IMMEDIATE")  # another process may open it now
+                schema.metadata.create_all(connection)  # tables that are there already stay as they are
                 connection.exec_driver_sql(f"PRAGMA user_version = {schema.VERSION}")
-            connection.exec_driver_sql("COMMIT")
+                connection.exec_driver_sql("COMMIT")
     except (sa.exc.DatabaseError, sqlite3.DatabaseError) as error:
         engine.dispose()
         raise OutputError(f"{file}: cannot be opened ({error.args[0]}); name another folder with --data") from None
+    if version not in (0, schema.VERSION):
+        engine.dispose()
+        raise OutputError(
+            f"{file}: has tables of version {version}, this Terrafix knows {schema.VERSION}; "
+            "update Terrafix, or name another folder with --data"
+        )
     return Database(engine)
 
 
