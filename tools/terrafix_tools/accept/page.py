@@ -1,7 +1,6 @@
 """acceptance.html: one self-contained page. Failed rows come first."""
 
 import json
-from html import escape
 from pathlib import Path
 
 import msgspec
@@ -10,20 +9,9 @@ from terrafix_tools.accept.fly import Result
 from terrafix_tools.accept.measuring.results import BROKEN, JudgedRow, Verdict, with_unit
 from terrafix_tools.accept.table import NAME, Acceptance, markdown
 from terrafix_tools.pages.charts import Chart, spans_of
-from terrafix_tools.pages.document import (
-    Figure,
-    Html,
-    document,
-    figures,
-    folded,
-    header,
-    legend,
-    scroll,
-    section,
-    table,
-    write_file,
-)
+from terrafix_tools.pages.document import Figure, kit, macros, write_file
 
+OWN = macros("terrafix_tools/acceptance.html")
 ERROR_FLOOR_M = 0.5  # of the logarithmic axis
 ERROR_TOP_M = 2000.0  # the same for all charts, to compare them
 WIDTH, HEIGHT = 400, 190  # of one chart, in its own units
@@ -52,11 +40,8 @@ def write(acceptance: Acceptance, out: Path) -> None:
 
 def page(acceptance: Acceptance) -> str:
     """The whole document."""
-    flown = [result for result in acceptance.results if result.points]
-    return document(
-        f"Acceptance: {acceptance.flight}",
-        f"{_head(acceptance)}{_broken(acceptance)}{_matrix(acceptance)}{_pictures(flown)}{_rows(acceptance)}",
-    )
+    parts = (_head(acceptance), _broken(acceptance), _matrix(acceptance), _pictures(acceptance), _rows(acceptance))
+    return kit.document(f"Acceptance: {acceptance.flight}", "", *parts)
 
 
 def _head(acceptance: Acceptance) -> str:
@@ -77,75 +62,66 @@ def _head(acceptance: Acceptance) -> str:
         f"terrafix {machine['versions'].get('terrafix', '')}",
     ]
     line = " · ".join(fact for fact in facts if fact)
-    return header("", "Acceptance", acceptance.flight, line) + figures(shown)
+    return kit.header("", "Acceptance", acceptance.flight, line) + kit.figures(shown)
 
 
 def _broken(acceptance: Acceptance) -> str:
     rows = [row for row in acceptance.rows if row.verdict in BROKEN]
     if not rows:
-        return "<h2>Every floor that was measured holds</h2>"
-    items = "".join(
-        f"<li><b>{escape(name)}</b><div>"
-        + "".join(
-            f"<span>{row.ac}: {escape(row.what)} {_number(row)}{', floor ' + escape(row.floor) if row.floor else ''}"
-            f"{'; ' + escape(row.why) if row.why else ''}</span>"
-            for row in rows
-            if row.scenario == name
-        )
-        + "</div></li>"
+        return kit.section("Every floor that was measured holds", "")
+    scenarios = [
+        (name, [_broken_row(row) for row in rows if row.scenario == name])
         for name in dict.fromkeys(row.scenario for row in rows)
-    )
-    return f'<h2>What does not pass</h2><ul class="broken">{items}</ul>'
+    ]
+    return kit.section("What does not pass", "", OWN.broken(scenarios))
 
 
-def _number(row: JudgedRow) -> str:
-    return (
-        f'<b class="bad">{escape(with_unit(row.measured, row.unit) if row.measured is not None else row.verdict)}</b>'
-    )
+def _broken_row(row: JudgedRow) -> tuple[str, str, str, str]:
+    measured = with_unit(row.measured, row.unit) if row.measured is not None else str(row.verdict)
+    more = (f", floor {row.floor}" if row.floor else "") + (f"; {row.why}" if row.why else "")
+    return row.ac, row.what, measured, more
 
 
 def _matrix(acceptance: Acceptance) -> str:
     """Scenarios down, requirements across; a cell shows its worst row."""
     columns = sorted({row.ac for row in acceptance.rows}, key=lambda ac: (ac[:2], int(ac.split("-")[1])))
-    names = list(dict.fromkeys(row.scenario for row in acceptance.rows))
-    head = "".join(f"<th>{ac}</th>" for ac in columns)
-    body = ""
-    for name in names:
-        cells = "".join(
-            _cell([row for row in acceptance.rows if row.scenario == name and row.ac == ac]) for ac in columns
-        )
-        body += f"<tr><th>{escape(name)}</th>{cells}</tr>"
-    return section(
+    rows = [
+        (name, [_cell([row for row in acceptance.rows if (row.scenario, row.ac) == (name, ac)]) for ac in columns])
+        for name in dict.fromkeys(row.scenario for row in acceptance.rows)
+    ]
+    return kit.section(
         "Scenarios and requirements",
         "Green holds its floor, red does not, grey could not be measured here. A cell shows the worst of its rows; "
         "point at it for all of them.",
-        scroll(f'<table class="matrix"><tr><th></th>{head}</tr>{body}</table>'),
+        OWN.matrix(columns, rows),
     )
 
 
-def _cell(rows: list[JudgedRow]) -> str:
+def _cell(rows: list[JudgedRow]) -> tuple[str, str, str] | None:
+    """CSS class, tip, text."""
     if not rows:
-        return "<td></td>"
+        return None
     order = (Verdict.BELOW, Verdict.NOT_BUILT, Verdict.PASS, Verdict.NOT_MEASURABLE)
     worst = min(rows, key=lambda row: order.index(row.verdict))
     tip = "\n".join(
         f"{r.what}: {with_unit(r.measured, r.unit)}, {r.verdict}{'; ' + r.why if r.why else ''}" for r in rows
     )
-    text = with_unit(worst.measured, worst.unit) if worst.measured is not None else MARKS[worst.verdict][1]
-    css = MARKS[worst.verdict][0]
-    return f'<td class="m-{css}" title="{escape(tip)}">{escape(text)}</td>'
+    css, word = MARKS[worst.verdict]
+    return css, tip, with_unit(worst.measured, worst.unit) if worst.measured is not None else word
 
 
-def _pictures(results: list[Result]) -> str:
-    return section(
+def _pictures(acceptance: Acceptance) -> str:
+    return kit.section(
         "Error and claim, scenario by scenario",
         "The line is the error, the shaded area the claimed 95 % radius: a consistent covariance covers the line. "
         "Grey: a fault. Below each picture, where the position came from.",
-        f'<div class="multiples">{"".join(map(_picture, results))}</div>{legend(KEYS)}',
+        OWN.pictures([_picture(result) for result in acceptance.results if result.points]),
+        kit.legend(KEYS),
     )
 
 
-def _picture(result: Result) -> str:
+def _picture(result: Result) -> tuple[str, str, str, str, str]:
+    """Name, css class and words of its verdict, promise, SVG."""
     zero_s, end_s = result.points[0].t_s, result.points[-1].t_s
     chart = Chart(
         x_max=max(end_s - zero_s, 1.0), y_min=ERROR_FLOOR_M, y_max=ERROR_TOP_M, width=WIDTH, height=HEIGHT, log_y=True,
@@ -163,17 +139,14 @@ def _picture(result: Result) -> str:
         chart.bottom_strip(low, high, f"f-{label or 'none'}", WORDS.get(label, "no position"), STRIP)
     broken = sum(row.verdict in BROKEN for row in result.rows)
     css, words = ("bad", f"{broken} below floor or not built") if broken else ("good", "holds")
-    return (
-        f'<figure class="multiple"><figcaption><b>{escape(result.scenario)}</b> <span class="{css}">{words}</span>'
-        f"<br>{escape(result.promise)}</figcaption>{chart.svg(f'Error and claim: {result.scenario}')}</figure>"
-    )
+    return result.scenario, css, words, result.promise, chart.svg(f"Error and claim: {result.scenario}")
 
 
 def _rows(acceptance: Acceptance) -> str:
     columns = ("scenario", "row", "what", "measured", "floor", "goal", "verdict", "")
     rows = []
     for row in acceptance.rows:
-        verdict = f'<span class="{MARKS[row.verdict][0]}">{row.verdict}{", goal met" if row.goal_met else ""}</span>'
+        verdict = OWN.verdict(MARKS[row.verdict][0], f"{row.verdict}{', goal met' if row.goal_met else ''}")
         measured = with_unit(row.measured, row.unit)
-        rows.append([row.scenario, row.ac, row.what, measured, row.floor, row.goal, Html(verdict), row.why])
-    return folded(f"All {len(rows)} rows", table(columns, rows, css="rows"))
+        rows.append([row.scenario, row.ac, row.what, measured, row.floor, row.goal, verdict, row.why])
+    return kit.folded(f"All {len(rows)} rows", kit.table(columns, rows, css="rows"))

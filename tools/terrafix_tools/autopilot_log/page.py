@@ -5,7 +5,7 @@ from typing import Any
 
 from terrafix_tools.autopilot_log.text import clock_line, percent
 from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
-from terrafix_tools.pages.document import Figure, document, figures, header, legend, scroll, section, table, timeline
+from terrafix_tools.pages.document import Figure, kit
 
 COLOURS = (
     ("claim", "k-sat"),
@@ -31,11 +31,18 @@ def page(found: dict[str, Any]) -> str:
     log = found["log"]
     name = log["path"].rsplit("/", 1)[-1]
     about = f"{log['kind']} · {log['firmware'] or 'unknown firmware'} · record {found['record']}"
-    return document(
+    return kit.document(
         f"{name} - autopilot's log",
-        f"{header('Terrafix, log of the autopilot on the time of a record', name, about)}"
-        f"{_figures(found)}{_events(found)}{_states(found)}{_ratios(found)}{_sent(found)}{_innovations(found)}"
-        f"{_receivers(found)}{_clock(found['clock'])}",
+        "",
+        kit.header("Terrafix, log of the autopilot on the time of a record", name, about),
+        _figures(found),
+        _events(found),
+        _states(found),
+        _ratios(found),
+        _sent(found),
+        _innovations(found),
+        _receivers(found),
+        _clock(found["clock"]),
     )
 
 
@@ -52,12 +59,12 @@ def _figures(found: dict[str, Any]) -> str:
         tiles.append(Figure(f"{worst['max']:.2f}", "", f"largest test ratio ({name})", mood))
     if sent is not None:
         tiles.append(Figure(f"{sent['median_m']:.1f}", "m", "GPS_INPUT from the EKF, median"))
-    return figures(tiles)
+    return kit.figures(tiles)
 
 
 def _events(found: dict[str, Any]) -> str:
     rows = [(stamp(event["t_s"]), _event(event)) for event in found["events"]]
-    return section("Events", "", timeline(rows)) if rows else section("Events", "None.")
+    return kit.section("Events", "", kit.timeline(rows)) if rows else kit.section("Events", "None.")
 
 
 def _event(event: dict[str, Any]) -> str:
@@ -86,11 +93,11 @@ def _states(found: dict[str, Any]) -> str:
     shown = [band for band in bands if band.name != "mode" or band.spans]
     if not shown:
         return ""
-    return section(
+    return kit.section(
         "Receivers and what is fused",
         "Fix: green is 3D, orange 2D, red none. Used: what the autopilot has selected. EKF: what its primary core "
         "fuses or is. The pointer on a stretch shows its name.",
-        scroll(strips(shown, found["duration_s"], "Receivers and fusion", NAME_WIDTH)),
+        kit.scroll(strips(shown, found["duration_s"], "Receivers and fusion", NAME_WIDTH)),
     )
 
 
@@ -103,7 +110,7 @@ def _coloured(spans: list[tuple[float, float, str]]) -> list[tuple[float, float,
 def _ratios(found: dict[str, Any]) -> str:
     ratios = found["test_ratios"]
     if not ratios:
-        return section("Test ratios", "The log has none.")
+        return kit.section("Test ratios", "The log has none.")
     shown = [name for name in ("velocity", "position", "height", "mag") if name in ratios] or list(ratios)[:4]
     top = max(MIN_RATIO_AXIS, *(ratios[name]["max"] for name in shown))
     chart = Chart(found["duration_s"], 0.0, 1.1 * top, y_unit="", follow=False)
@@ -114,12 +121,12 @@ def _ratios(found: dict[str, Any]) -> str:
         [name, ratio["max"], f"{ratio['max_at_s']:.1f} s", f"{100 * ratio['above_gate_share']:.1f} %"]
         for name, ratio in ratios.items()
     ]
-    return section(
+    return kit.section(
         "Test ratios",
         "Innovation over the limit of its gate, primary core: above 1 the EKF rejects the measurement.",
         _legend(shown),
-        scroll(chart.svg("Test ratios over time")),
-        table(["measurement", "largest", "at", "above the gate"], rows),
+        kit.scroll(chart.svg("Test ratios over time")),
+        kit.table(["measurement", "largest", "at", "above the gate"], rows),
     )
 
 
@@ -131,16 +138,16 @@ def _innovations(found: dict[str, Any]) -> str:
         if shown:
             series = [(name, innovations[name]["series"]) for name in shown]
             labels = [AXES.get(name.split("_")[1], "yaw") for name in shown]
-            parts.append(f"<h3>{title}</h3>{_legend(labels)}{_lines(found, series, unit, f'{title} innovations')}")
-    return section("Innovations", "Of the primary core of the EKF." if parts else "The log has none.", *parts)
+            parts.append(kit.block(title, _legend(labels), _lines(found, series, unit, f"{title} innovations")))
+    return kit.section("Innovations", "Of the primary core of the EKF." if parts else "The log has none.", *parts)
 
 
 def _sent(found: dict[str, Any]) -> str:
     sent = found["sent_less_ekf"]
     if sent is None:
-        return section("GPS_INPUT against the EKF", "Nothing was sent, or the log has no position.")
+        return kit.section("GPS_INPUT against the EKF", "Nothing was sent, or the log has no position.")
     series = [(name, sent[f"{name}_m"]) for name in ("north", "east", "down")]
-    return section(
+    return kit.section(
         "GPS_INPUT against the EKF",
         "Position that was sent less the position that the autopilot navigated by at that time. Horizontal distance: "
         f"median {sent['median_m']:.2f} m, 95 % {sent['p95_m']:.2f} m, at most {sent['max_m']:.2f} m "
@@ -157,7 +164,7 @@ def _lines(found: dict[str, Any], series: list[tuple[str, list[list[float]]]], u
     chart.level(0.0)
     for (_, points), (css, _) in zip(series, COLOURS, strict=False):
         chart.line(_with_gaps(points), css)
-    return scroll(chart.svg(label))
+    return kit.scroll(chart.svg(label))
 
 
 def _with_gaps(points: list[list[float]]) -> list[Point]:
@@ -170,7 +177,7 @@ def _with_gaps(points: list[list[float]]) -> list[Point]:
 
 
 def _legend(names: list[str]) -> str:
-    return legend((css, name) for name, (_, css) in zip(names, COLOURS, strict=False))
+    return kit.legend((css, name) for name, (_, css) in zip(names, COLOURS, strict=False))
 
 
 def _receivers(found: dict[str, Any]) -> str:
@@ -186,7 +193,7 @@ def _receivers(found: dict[str, Any]) -> str:
         for receiver in found["gps"]
     ]
     columns = ["receiver", "samples", "3D fix", "used", "satellites, median", "stated accuracy, median"]
-    return section("Receivers", "", table(columns, rows)) if rows else ""
+    return kit.section("Receivers", "", kit.table(columns, rows)) if rows else ""
 
 
 def _number(value: float | None, unit: str) -> str:
@@ -194,7 +201,7 @@ def _number(value: float | None, unit: str) -> str:
 
 
 def _clock(about: dict[str, Any]) -> str:
-    return section(
+    return kit.section(
         "Clocks",
         f"{clock_line(about).removeprefix('clocks: ')}. Line through the offsets of {about['windows']} windows, which "
         f"scatter by {1e3 * about['scatter_s']:.1f} ms; the attitudes differ by {about['attitude_deg']:.2f} degrees "

@@ -4,7 +4,7 @@ from typing import Any
 
 from terrafix_tools.compare.text import divergence, summary
 from terrafix_tools.pages.charts import Chart, Point, clock
-from terrafix_tools.pages.document import document, header, scroll, section, table, timeline
+from terrafix_tools.pages.document import kit
 
 MIN_DISTANCE_M = 0.01  # height of the chart where the positions are equal
 
@@ -12,17 +12,22 @@ MIN_DISTANCE_M = 0.01  # height of the chart where the positions are equal
 def page(comparison: dict[str, Any], distances_m: list[tuple[float, float]]) -> str:
     """``distances_m``: (time [s], distance of the two positions [m]) of each frame."""
     a, b = (comparison[name]["path"] for name in ("a", "b"))
-    return document(
+    return kit.document(
         f"{a} and {b}",
-        f"{header('Terrafix, two records of one flight', next(summary(comparison)), f'A: {a} · B: {b}')}"
-        f"{_distances(comparison, distances_m)}{_differences(comparison)}{_messages(comparison)}"
-        f"{_verdicts(comparison)}{_delays(comparison)}{_changes(comparison)}",
+        "",
+        kit.header("Terrafix, two records of one flight", next(summary(comparison)), f"A: {a} · B: {b}"),
+        _distances(comparison, distances_m),
+        _differences(comparison),
+        _messages(comparison),
+        _verdicts(comparison),
+        _delays(comparison),
+        _changes(comparison),
     )
 
 
 def _distances(comparison: dict[str, Any], distances_m: list[tuple[float, float]]) -> str:
     if not distances_m:
-        return section("Distance of the positions", "No frame has a position in both.")
+        return kit.section("Distance of the positions", "No frame has a position in both.")
     top = max(MIN_DISTANCE_M, max(metres for _, metres in distances_m))
     chart = Chart(x_max=max(t for t, _ in distances_m), y_min=0.0, y_max=1.1 * top, height=240, follow=False)
     points: list[Point] = list(distances_m)
@@ -30,10 +35,10 @@ def _distances(comparison: dict[str, Any], distances_m: list[tuple[float, float]
     first = comparison["first"]
     if first is not None:
         chart.vertical_line(first["t_s"], "first difference")
-    return section(
+    return kit.section(
         "Distance of the positions",
         "Horizontal, between the last estimates of each frame.",
-        scroll(chart.svg("Distance of the positions over time")),
+        kit.scroll(chart.svg("Distance of the positions over time")),
     )
 
 
@@ -41,17 +46,17 @@ def _differences(comparison: dict[str, Any]) -> str:
     if comparison["equal"]:
         return ""
     rows = ((clock(round(found["t_s"])), divergence(found)) for found in comparison["first_of_each_message"])
-    return section("First difference of each message", "", timeline(rows))
+    return kit.section("First difference of each message", "", kit.timeline(rows))
 
 
 def _messages(comparison: dict[str, Any]) -> str:
     rows = [[kind, *count.values()] for kind, count in comparison["messages"].items()]
-    return section("Messages", "", table(["message", "equal", "different", "only in A", "only in B"], rows))
+    return kit.section("Messages", "", kit.table(["message", "equal", "different", "only in A", "only in B"], rows))
 
 
 def _verdicts(comparison: dict[str, Any]) -> str:
     rows = [[f"{row['measurement']}: {row['verdict']}", row["a"], row["b"]] for row in comparison["verdicts"]]
-    return section("Verdicts", "", table(["measurement", "A", "B"], rows)) if rows else ""
+    return kit.section("Verdicts", "", kit.table(["measurement", "A", "B"], rows)) if rows else ""
 
 
 def _delays(comparison: dict[str, Any]) -> str:
@@ -60,10 +65,10 @@ def _delays(comparison: dict[str, Any]) -> str:
     if not known:
         return ""
     rows = [[p, *((found[x] or {}).get(p) for x in ("a", "b"))] for p in known[0]]
-    return section(
+    return kit.section(
         "Timing",
         "From the exposure of a frame to the publication of its last estimate, ms. A replay has no clock: 0.",
-        table(["percentile", "A", "B"], rows),
+        kit.table(["percentile", "A", "B"], rows),
     )
 
 
@@ -73,4 +78,4 @@ def _changes(comparison: dict[str, Any]) -> str:
         for what in ("configuration", "versions")
         for change in comparison[what]
     ]
-    return section("Configuration and versions", "", table(["name", "A", "B"], rows)) if rows else ""
+    return kit.section("Configuration and versions", "", kit.table(["name", "A", "B"], rows)) if rows else ""

@@ -1,28 +1,15 @@
 """`terrafix fleet page`: trends of a fleet and where it fails, as one HTML page without other files."""
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from terrafix_tools.fleet.places import KEYS, Grid, grids, picture, words, worst
 from terrafix_tools.fleet.query import FleetTables
 from terrafix_tools.pages.charts import Chart, Point
-from terrafix_tools.pages.document import (
-    Figure,
-    Html,
-    counts,
-    document,
-    figures,
-    header,
-    legend,
-    scroll,
-    section,
-    share_bar,
-    table,
-    write_file,
-)
+from terrafix_tools.pages.document import Figure, kit, macros, write_file
 
+OWN = macros("terrafix_tools/fleet.html")
 MAX_GROUPS = 12  # rows of a trend
 LEAST_MONTHS = 5  # of the chart by month; over fewer the trend by season says as much
 MAX_MAPS, MAX_WORST, MAX_ERRORS = 12, 12, 20
@@ -57,10 +44,8 @@ def write_page(fleet: Path, out: Path) -> None:
 
 def page(tables: FleetTables, fleet: Path) -> str:
     name = fleet.resolve().name
-    body = (
-        _head(tables, name) + _months(tables) + _trends(tables) + _reasons(tables) + _places(tables) + _errors(tables)
-    )
-    return document(f"{name} - fleet", body)
+    parts = (_head(tables, name), _months(tables), _trends(tables), _reasons(tables), _places(tables), _errors(tables))
+    return kit.document(f"{name} - fleet", "", *parts)
 
 
 def _head(tables: FleetTables, name: str) -> str:
@@ -78,7 +63,7 @@ def _head(tables: FleetTables, name: str) -> str:
     ]
     dates = f"{about['first']} to {about['last']}" if about["first"] else "no flight has a date"
     dates += f"; {about['replays']} of the flights are replays" if about["replays"] else ""
-    return header("Terrafix fleet", name, dates) + figures(tiles)
+    return kit.header("Terrafix fleet", name, dates) + kit.figures(tiles)
 
 
 def _months(tables: FleetTables) -> str:
@@ -110,16 +95,16 @@ def _months(tables: FleetTables) -> str:
         for month, row in zip(at, rows, strict=True)
     ]
     chart.line(without, "none")
-    return section(
+    return kit.section(
         "By month",
         f"Months from January {rows[0]['month'].year}. Bars: share of the map matches that were refused; line: frames "
         "without a position.",
-        scroll(chart.svg("Refused map matches by month")),
+        kit.scroll(chart.svg("Refused map matches by month")),
     )
 
 
 def _trends(tables: FleetTables) -> str:
-    return section(
+    return kit.section(
         "Trends",
         "Shares of all frames of a group; sigma is the median of the stated horizontal 1-sigma. Refused: map matches "
         "that a check has rejected, of all frames that were matched. Of a flight without a date (a replay) the season "
@@ -135,11 +120,11 @@ def _trend(tables: FleetTables, title: str, group: str) -> str:
     most = max([value for value in sigmas.values() if value is not None], default=1.0)
     lines = [_group(title, row, sigmas.get(row["name"]), most) for row in shown]
     heads = ("", "flights", "hours", "with a position", "refused", "sigma")
-    return f"<h3>{escape(title)}</h3>{table(heads, lines, css='trend')}{_more(rows, MAX_GROUPS)}"
+    return kit.block(title, kit.table(heads, lines, css="trend"), _more(rows, MAX_GROUPS))
 
 
 def _more(found: Sequence[Any], shown: int, what: str = "") -> str:
-    return f'<p class="quiet">and {len(found) - shown} more{what}</p>' if len(found) > shown else ""
+    return kit.quiet(f"and {len(found) - shown} more{what}") if len(found) > shown else ""
 
 
 def _group(title: str, row: dict[str, Any], sigma_m: float | None, most_m: float) -> list[object]:
@@ -151,9 +136,9 @@ def _group(title: str, row: dict[str, Any], sigma_m: float | None, most_m: float
         name,
         row["flights"],
         f"{row['hours'] or 0:.2f}",
-        Html(f"{share_bar(row['availability'] or 0, 'k-good')}{_percent(row['availability'])} %"),
-        Html(f"{share_bar(row['refused'] or 0, 'k-dead')}{_percent(row['refused'])} %"),
-        Html(f"{share_bar((sigma_m or 0) / max(most_m, 1e-9), 'k-claim')}{sigma}"),
+        kit.share_bar(row["availability"] or 0, "k-good", f"{_percent(row['availability'])} %"),
+        kit.share_bar(row["refused"] or 0, "k-dead", f"{_percent(row['refused'])} %"),
+        kit.share_bar((sigma_m or 0) / max(most_m, 1e-9), "k-claim", sigma),
     ]
 
 
@@ -170,24 +155,27 @@ def _reasons(tables: FleetTables) -> str:
     rows = tables.ask(REASONS).objects()
     if not rows:
         return ""
-    return section("Reasons of refusal", "", counts([(words(row["reason"]), row["frames"], "k-dead") for row in rows]))
+    return kit.section(
+        "Reasons of refusal", "", kit.counts([(words(row["reason"]), row["frames"], "k-dead") for row in rows])
+    )
 
 
 def _places(tables: FleetTables) -> str:
     found = grids(tables)
     if not found:
         return ""
-    shown = "".join(
-        f"<div><h3>{escape(grid.map or 'map unknown')}</h3>"
-        f'<p class="quiet">{grid.frames} frames, cells of {grid.cell_m} m</p>{picture(grid)}</div>'
+    shown = [
+        (grid.map or "map unknown", f"{grid.frames} frames, cells of {grid.cell_m} m", picture(grid))
         for grid in found[:MAX_MAPS]
-    )
-    return section(
+    ]
+    return kit.section(
         "Where it fails",
         "Share of the matched frames in each cell that were refused, north up. "
         "A frame without a position is in no cell.",
-        legend(KEYS),
-        f'<div class="two places">{shown}</div>{_more(found, MAX_MAPS, " maps")}{_worst(found)}',
+        kit.legend(KEYS),
+        OWN.places(shown),
+        _more(found, MAX_MAPS, " maps"),
+        _worst(found),
     )
 
 
@@ -205,15 +193,15 @@ def _worst(found: list[Grid]) -> str:
         ]
         for grid, cell in cells
     ]
-    return f"<h3>Worst cells</h3>{table(['map', 'latitude, longitude', 'frames', 'refused', 'mostly'], rows)}"
+    return kit.block("Worst cells", kit.table(["map", "latitude, longitude", "frames", "refused", "mostly"], rows))
 
 
 def _errors(tables: FleetTables) -> str:
     rows = tables.ask("SELECT record, error FROM errors ORDER BY record").rows
     if not rows:
         return ""
-    shown = table(["record", "reason"], rows[:MAX_ERRORS])
-    return section("Records that could not be read", "", shown, _more(rows, MAX_ERRORS))
+    shown = kit.table(["record", "reason"], rows[:MAX_ERRORS])
+    return kit.section("Records that could not be read", "", shown, _more(rows, MAX_ERRORS))
 
 
 def _percent(share: float | None) -> str:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
+from markupsafe import Markup
+
 from terrafix_tools.fleet.query import FleetTables
 
 MAX_CELLS = 30  # along the longer side
@@ -97,7 +99,7 @@ def picture(grid: Grid) -> str:
     scale = max(1, max(grid.columns, LEAST_COLUMNS) // 4)
     y = height + MARGIN_PX / 2
     label = f"Share of refused frames on {grid.map or 'an unknown map'}"
-    return (
+    return Markup(
         f'<svg class="places" viewBox="-2 -2 {width + 4} {height + MARGIN_PX + 2}" role="img" '
         f'aria-label="{escape(label)}"><rect class="rail" width="{width}" height="{height}"/>{marks}'
         f'<path class="ruler" d="M0 {y - 3}v6M0 {y}h{scale * PX}m0 -3v6"/>'

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 
+from markupsafe import Markup
+
 from terrafix_tools.pages.series import Span, thin_line, thin_marks, thin_spans
 
 WIDTH = 1000  # of a chart across the whole page, in SVG units
@@ -131,7 +133,7 @@ class Chart:
         if self.follow:
             cursor = f'<line class="cursor" y1="{top}" y2="{self.height - AXIS}"/>'
             data = f' data-x0="{self.gutter}" data-x1="{self.width - RIGHT}" data-t1="{self.x_max:.3f}"'
-        return (
+        return Markup(
             f'<svg class="{css}" viewBox="0 0 {self.width} {self.height}" role="img"{data} '
             f'aria-label="{escape(label)}">{grid}{"".join(self.marks)}{cursor}</svg>'
         )

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.estimates import Row
+from terrafix_tools.pages.document import kit
 from terrafix_tools.pages.pictures import VOID_BGR, jpeg_uri
 from terrafix_tools.pages.series import thin_path
 from terrafix_tools.report.data import FlightView, ellipse95
@@ -50,7 +52,7 @@ def map_svg(view: FlightView, map_path: Path | None, marked: list[int], pointed:
     if not points and view.origin is not None:
         points = [(view.origin.lat_deg, view.origin.lon_deg)]
     if not points:
-        return '<p class="quiet">No position in this record.</p>'
+        return kit.quiet("No position in this record.")
     map_image = _map_image(points)
     u = map_image.width_px / 1000  # unit of line widths, constant across image sizes
     body = [
@@ -64,7 +66,7 @@ def map_svg(view: FlightView, map_path: Path | None, marked: list[int], pointed:
         _scale_bar(map_image, u),
         '<circle id="here" r="0"/>',
     ]
-    return (
+    return Markup(
         f'<svg id="map" viewBox="0 0 {map_image.width_px} {map_image.height_px}" style="--u:{u:.3f}px" role="img" '
         f'aria-label="Track over the map">{"".join(body)}</svg>'
     )

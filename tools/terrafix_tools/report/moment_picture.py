@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
@@ -139,4 +140,6 @@ def _image(uri: str | None, width: int, height: int) -> str:
 
 
 def _svg(width: int, height: int, label: str, parts: list[str]) -> str:
-    return f'<svg class="shot" viewBox="0 0 {width} {height}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+    return Markup(
+        f'<svg class="shot" viewBox="0 0 {width} {height}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+    )

@@ -3,7 +3,7 @@
 from typing import Any
 
 from terrafix_tools.pages.charts import HALF_WIDTH, Band, Chart, Point, spans_of, stamp, strips
-from terrafix_tools.pages.document import counts, facts, legend, scroll, section, table, two
+from terrafix_tools.pages.document import kit
 from terrafix_tools.report.data import FlightView, RejectedMatch, radius95_m
 
 MAX_REJECTED = 20  # rows of the table of rejected map matches
@@ -40,12 +40,12 @@ def accuracy(view: FlightView) -> str:
     keys = [("k-ink", "error of the immediate estimate"), ("k-claim", "reported 95 % radius")]
     if any(v is not None for _, v in refined):
         keys.insert(1, ("k-good", "error after refinement"))
-    return section(
+    return kit.section(
         "Error and reported accuracy",
         "Consistent accuracy: the error is inside the shaded 95 % radius in 95 of 100 frames, and the radius is not "
         "larger than necessary.",
-        scroll(chart.svg("Error and reported radius over time")),
-        legend(keys),
+        kit.scroll(chart.svg("Error and reported radius over time")),
+        kit.legend(keys),
         _cumulative(view),
     )
 
@@ -62,11 +62,11 @@ def _reported_only(view: FlightView, reported: list[Point], top: float) -> str:
     second = Chart(x_max=end_s(view), y_min=0.0, y_max=max(2.0, oldest * 1.1), height=150, y_unit="s")
     second.area(age, "age")
     second.line(age, "age")
-    return section(
+    return kit.section(
         "Reported accuracy",
         "Radius of the reported 95 % ellipse; below it the time since the last accepted map match. There is no ground "
         "truth for this flight.",
-        scroll(chart.svg("Reported radius over time"), second.svg("Age of the last map match")),
+        kit.scroll(chart.svg("Reported radius over time"), second.svg("Age of the last map match")),
     )
 
 
@@ -94,9 +94,9 @@ def _cumulative(view: FlightView) -> str:
     for errors, css in ((refined, "refined"), (immediate, "error")):
         steps: list[Point] = [(max(1.0, e), 100 * (i + 1) / total) for i, e in enumerate(errors)]
         chart.line([*steps, (top, 100 * len(errors) / total)] if steps else [], css)
-    return two(
-        f"<h3>Share of frames within a distance of the truth</h3>{chart.svg('Cumulative error')}",
-        f"<h3>Metrics</h3>{facts(_accuracy_rows(view.evaluation or {}))}",
+    return kit.two(
+        kit.block("Share of frames within a distance of the truth", chart.svg("Cumulative error")),
+        kit.block("Metrics", kit.facts(_accuracy_rows(view.evaluation or {}))),
     )
 
 
@@ -137,12 +137,12 @@ def states(view: FlightView) -> str:
         ("k-dead", "dead reckoning, rejected, critical"),
         ("k-none", "no position"),
     ]
-    return section(
+    return kit.section(
         "Sources and states",
         "The source of each position, whether the map match of the frame was accepted, how the covariance was "
         "computed, and the temperature band.",
-        scroll(strips(bands, end, "States over time")),
-        legend(keys),
+        kit.scroll(strips(bands, end, "States over time")),
+        kit.legend(keys),
     )
 
 
@@ -154,11 +154,11 @@ def verdicts(view: FlightView) -> str:
     for measurement, found in view.verdicts.items():
         ranked = sorted(found.items(), key=lambda kv: (kv[0] != "accepted", -kv[1]))
         rows = [(why.replace("_", " "), n, "k-sat" if why == "accepted" else "k-dead") for why, n in ranked]
-        blocks.append(counts(rows, measurement))
+        blocks.append(kit.counts(rows, measurement))
     matched = sum(view.matched_by.values())
     shares = [f"{by} {100 * n / matched:.0f} %" for by, n in sorted(view.matched_by.items())]
     by = f" Frames matched with the map by: {', '.join(shares)}." if shares else ""
-    return section("Verdicts", f"Verdicts per measurement; rejected ones by reason.{by}", two(*blocks))
+    return kit.section("Verdicts", f"Verdicts per measurement; rejected ones by reason.{by}", kit.two(*blocks))
 
 
 def rejected_map_matches(view: FlightView) -> str:
@@ -167,11 +167,11 @@ def rejected_map_matches(view: FlightView) -> str:
         return ""
     ranked = sorted(view.rejected_maps, key=lambda match: 0.0 if match.test_ratio is None else -match.test_ratio)
     shown = sorted(ranked[:MAX_REJECTED], key=lambda match: match.t_s)
-    return section(
+    return kit.section(
         "Rejected map matches",
         f"{len(shown)} of {len(view.rejected_maps)} rejected map matches, those with the largest test ratios (squared "
         "Mahalanobis distance over the limit of the gate).",
-        table(
+        kit.table(
             ("time", "frame", "verdict", "raised by", "test ratio", "detail"), map(_rejected_row, shown), css="texts"
         ),
     )

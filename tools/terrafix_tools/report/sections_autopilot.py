@@ -8,7 +8,7 @@ from typing import Any
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
-from terrafix_tools.pages.document import facts, folded, legend, scroll, section, two
+from terrafix_tools.pages.document import kit
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.sections import end_s, spans
 from terrafix_tools.report.text import FIX_3D, GAP_S, gps_stats
@@ -39,12 +39,12 @@ def link(view: FlightView) -> str:
         bands.append(Band("link", spans(states, end, "f-", {"good": "connected", "bad": "not connected"})))
     bands += _flag_bands(view, end)
     sent = [] if stats is None else [_accuracies(view, end), _jumps(view, end), _intervals(view, end)]
-    return section(
+    return kit.section(
         "GPS_INPUT and the autopilot",
         "Above what was sent, below what the EKF of the autopilot reports of it (its horizontal position and velocity, "
         "its attitude, whether any sensor aids it), over the same time. "
         f"An interval over {1000 * GAP_S:.0f} ms is a gap.",
-        scroll(strips(bands, end, "Link over time"), *sent, _ratios(view, end)),
+        kit.scroll(strips(bands, end, "Link over time"), *sent, _ratios(view, end)),
         _tables(view),
         _texts(view),
     )
@@ -85,7 +85,7 @@ def _accuracies(view: FlightView, end: float) -> str:
     for css, points in series:
         chart.line(points, css)
     keys = [("k-sat", "horizontal accuracy sent"), ("k-good", "vertical accuracy sent")]
-    return f"<h3>Accuracy sent</h3>{chart.svg('Accuracy sent over time')}{legend(keys)}"
+    return kit.block("Accuracy sent", chart.svg("Accuracy sent over time"), kit.legend(keys))
 
 
 def _jumps(view: FlightView, end: float) -> str:
@@ -104,7 +104,7 @@ def _jumps(view: FlightView, end: float) -> str:
     largest = max((v for _, v in points if v is not None), default=0.0)
     chart = Chart(x_max=end, y_min=0.0, y_max=max(0.5, 1.15 * largest), height=130)
     chart.line(points, "age")
-    return f"<h3>Steps of the position beyond the velocity sent</h3>{chart.svg('Steps of the position sent')}"
+    return kit.block("Steps of the position beyond the velocity sent", chart.svg("Steps of the position sent"))
 
 
 def _intervals(view: FlightView, end: float) -> str:
@@ -114,7 +114,7 @@ def _intervals(view: FlightView, end: float) -> str:
     chart = Chart(x_max=end, y_min=20.0, y_max=max(300.0, top * 1.2), height=150, log_y=True, y_unit="ms")
     chart.level(1000 * GAP_S, f"{1000 * GAP_S:.0f} ms")
     chart.line(steps, "error")
-    return f"<h3>Interval between messages</h3>{chart.svg('Interval of GPS_INPUT')}"
+    return kit.block("Interval between messages", chart.svg("Interval of GPS_INPUT"))
 
 
 def _ratios(view: FlightView, end: float) -> str:
@@ -129,7 +129,7 @@ def _ratios(view: FlightView, end: float) -> str:
     chart.line(velocities, "age")
     chart.line(positions, "error")
     keys = [("k-ink", "position"), ("k-vis", "velocity")]
-    return f"<h3>Test ratios of the EKF</h3>{chart.svg('Test ratios of the EKF over time')}{legend(keys)}"
+    return kit.block("Test ratios of the EKF", chart.svg("Test ratios of the EKF over time"), kit.legend(keys))
 
 
 def _tables(view: FlightView) -> str:
@@ -159,9 +159,11 @@ def _tables(view: FlightView) -> str:
     peer = [
         (k.replace("_", " "), f"{round(v, 3):g}" if isinstance(v, float) else str(v)) for k, v in _scalars(view.peer)
     ]
-    counted = folded("Counted by the autopilot", facts(peer)) if peer else ""
-    first = f"<h3>Sent</h3>{facts(sent)}" if sent else ""
-    return two(first, f"<h3>Received by the autopilot</h3>{facts(used)}{counted}" if used or peer else "")
+    counted = kit.folded("Counted by the autopilot", kit.facts(peer)) if peer else ""
+    return kit.two(
+        kit.block("Sent", kit.facts(sent)) if sent else "",
+        kit.block("Received by the autopilot", kit.facts(used), counted) if used or peer else "",
+    )
 
 
 def _texts(view: FlightView) -> str:
@@ -170,7 +172,7 @@ def _texts(view: FlightView) -> str:
     texts = [(stamp(t), text.text) for t, text in view.pilot_texts[:MAX_TEXTS]]
     count = len(view.pilot_texts)
     shown = f"{count}" if count <= MAX_TEXTS else f"the first {MAX_TEXTS} of {count}"
-    return folded(f"Texts to the pilot ({shown})", facts(texts))
+    return kit.folded(f"Texts to the pilot ({shown})", kit.facts(texts))
 
 
 def _scalars(peer: dict[str, Any]) -> list[tuple[str, Any]]:

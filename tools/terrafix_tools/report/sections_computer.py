@@ -2,14 +2,13 @@
 
 from collections import defaultdict
 from collections.abc import Callable
-from html import escape
 
 import numpy as np
 
 from terrafix.health.load import ALL
 from terrafix.messages import ThermalReading
 from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
-from terrafix_tools.pages.document import facts, folded, legend, scroll, section, table
+from terrafix_tools.pages.document import kit
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.sections import end_s, spans
 from terrafix_tools.report.stage_times import STAGES
@@ -28,7 +27,7 @@ def computer(view: FlightView) -> str:
     parts = [_latency(view), _load(view), _heat(view), _processes(view)]
     if not any(parts):
         return ""
-    return section("Computer", "", *parts)
+    return kit.section("Computer", "", *parts)
 
 
 def _latency(view: FlightView) -> str:
@@ -53,12 +52,15 @@ def _latency(view: FlightView) -> str:
     for css, points in chart_points:
         chart.line(points, css)
     keys = [(key, stage) for key, stage in zip(STAGE_KEYS, STAGES, strict=True) if times.delay_ns[stage]]
-    return (
-        '<h3>Latency by stage</h3><p class="quiet">From the exposure of a frame to the reception at the recorder, '
-        'to 10 ms. "Step": since the stage before. "estimate": the last one of a frame; '
-        '"GPS_INPUT": the first one after it.</p>'
-        f"{table(('stage', 'step, median', 'median', '95 %', '99 %'), rows)}"
-        f"{scroll(chart.svg('Latency by stage over time'))}{legend(keys)}"
+    return kit.block(
+        "Latency by stage",
+        kit.quiet(
+            'From the exposure of a frame to the reception at the recorder, to 10 ms. "Step": since the stage before. '
+            '"estimate": the last one of a frame; "GPS_INPUT": the first one after it.'
+        ),
+        kit.table(("stage", "step, median", "median", "95 %", "99 %"), rows),
+        kit.scroll(chart.svg("Latency by stage over time")),
+        kit.legend(keys),
     )
 
 
@@ -76,10 +78,8 @@ def _load(view: FlightView) -> str:
     by_process = _lines(view, "By process", "%", 2.0, lambda r: {k: 100 * v for k, v in r.cpu_load.items() if k != ALL})
     if not whole:
         return ""
-    return (
-        '<h3>Processor load</h3><p class="quiet">Of all cores together, other programs included; of one core by '
-        f"process, so that several threads may exceed 100 %.</p>{scroll(whole, by_process)}"
-    )
+    about = "Of all cores together, other programs included; of one core by process, so that several threads may "
+    return kit.block("Processor load", kit.quiet(f"{about}exceed 100 %."), kit.scroll(whole, by_process))
 
 
 def _heat(view: FlightView) -> str:
@@ -102,9 +102,9 @@ def _heat(view: FlightView) -> str:
         limited = [(t, "hot" if health.throttled else "normal") for t, health in view.health]
         bands.append(Band("throttled", spans(limited, end, "f-", {"hot": "throttled", "normal": "not throttled"})))
     causes = list(dict.fromkeys(health.cause for _, health in view.health if health.cause))
-    said = f'<p class="quiet">{escape("; ".join(causes[:4]))}</p>' if causes else ""
+    said = kit.quiet("; ".join(causes[:4])) if causes else ""
     strip = strips(bands, end, "Thermal band over time") if bands else ""
-    return f"<h3>Heat and power</h3>{said}{scroll(strip, heat, clocks, power)}"
+    return kit.block("Heat and power", said, kit.scroll(strip, heat, clocks, power))
 
 
 def _lines(
@@ -118,7 +118,7 @@ def _lines(
     if not largest:
         return ""
     chart = _chart(name, unit, margin, [(series[key], css) for key, css in zip(largest, LINES, strict=False)], view)
-    return chart + legend(list(zip(KEYS, largest, strict=False)))
+    return chart + kit.legend(zip(KEYS, largest, strict=False))
 
 
 def _line(name: str, unit: str, margin: float, points: list[Point], view: FlightView) -> str:
@@ -132,7 +132,7 @@ def _chart(name: str, unit: str, margin: float, series: list[tuple[list[Point], 
     chart = Chart(x_max=end_s(view), y_min=min(values) - margin, y_max=max(values) + margin, height=150, y_unit=unit)
     for points, css in series:
         chart.line(points, css)
-    return f"<h4>{name}</h4>{chart.svg(name)}"
+    return kit.chart(name, chart.svg(name))
 
 
 def _processes(view: FlightView) -> str:
@@ -152,7 +152,9 @@ def _processes(view: FlightView) -> str:
     keys = [("k-good", "started, stopped"), ("k-dead", "died, stuck, given up")]
     keys += [("k-vis", "messages lost")] if view.losses else []
     lost = [(name, str(count)) for name, count in view.dropped.most_common(8)]
-    return (
-        f"<h3>Processes</h3>{scroll(strips(bands, end, 'Processes over time'))}{legend(keys)}"
-        f"{folded('Messages lost', facts(lost)) if lost else ''}"
+    return kit.block(
+        "Processes",
+        kit.scroll(strips(bands, end, "Processes over time")),
+        kit.legend(keys),
+        kit.folded("Messages lost", kit.facts(lost)) if lost else "",
     )

@@ -5,7 +5,7 @@ from collections import defaultdict
 from terrafix.link.gnss.spoofing_detector import AGREEMENT_SIGMAS
 from terrafix.messages import GnssReading, GnssVerdict
 from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
-from terrafix_tools.pages.document import facts, folded, legend, scroll, section
+from terrafix_tools.pages.document import kit
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.sections import end_s, spans
 
@@ -41,13 +41,13 @@ def gnss(view: FlightView) -> str:
     ]
     distances = {receiver: [(t, v.distance_m) for t, v in found] for receiver, found in states.items()}
     sigmas = {receiver: [(t, v.sigmas) for t, v in found] for receiver, found in states.items()}
-    return section(
+    return kit.section(
         "GNSS receivers",
         "What the judge says of each receiver of the autopilot, and how far its position is from the estimate. No "
         "receiver is fused in flight.",
-        scroll(
+        kit.scroll(
             strips(bands, end, "State of the receivers over time"),
-            legend(keys),
+            kit.legend(keys),
             _chart("Distance from the estimate", "m", distances, end, None),
             _chart("The same in standard deviations of both", "", sigmas, end, AGREEMENT_SIGMAS),
         ),
@@ -65,7 +65,7 @@ def _chart(name: str, unit: str, series: dict[int, list[Point]], end: float, lev
     for i, (_, points) in enumerate(sorted(series.items())):
         chart.line(points, LINES[i % len(LINES)])
     keys = [(KEYS[i % len(KEYS)], f"GPS{receiver + 1}") for i, receiver in enumerate(sorted(series))]
-    return f"<h3>{name}</h3>{chart.svg(name)}{legend(keys) if len(keys) > 1 else ''}"
+    return kit.block(name, chart.svg(name), kit.legend(keys) if len(keys) > 1 else "")
 
 
 def _changes(states: dict[int, list[tuple[float, GnssVerdict]]]) -> str:
@@ -79,4 +79,4 @@ def _changes(states: dict[int, list[tuple[float, GnssVerdict]]]) -> str:
             last = verdict.state
     rows.sort()
     count = f"{len(rows)}" if len(rows) <= MAX_CHANGES else f"the first {MAX_CHANGES} of {len(rows)}"
-    return folded(f"Changes of state ({count})", facts(row[1:] for row in rows[:MAX_CHANGES]))
+    return kit.folded(f"Changes of state ({count})", kit.facts(row[1:] for row in rows[:MAX_CHANGES]))

@@ -49,8 +49,8 @@ class Database:
 
 
 def open_database(folder: Path, *, durable: bool = True) -> Database:
-    """Opens ``folder``/FILE and makes its tables where it has none. ``durable``: a commit waits for the disk; else it survives
-    the end of the process, but maybe not a loss of power. Raises OutputError: no database, or one of another version."""
+    """Opens ``folder``/FILE and makes its tables where it has none. ``durable``: a commit waits for the disk; else it
+    survives the end of the process, but maybe not a loss of power. Raises OutputError, also for a later version."""
     file = folder / FILE
     engine = sa.create_engine(f"sqlite:///{file}", connect_args={"check_same_thread": False, "timeout": BUSY_MS / 1e3})
 

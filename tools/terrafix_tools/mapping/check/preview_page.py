@@ -4,14 +4,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from markupsafe import Markup
 
 from terrafix.core.errors import OutputError
 from terrafix_tools.mapping.check.sight import Sight
 from terrafix_tools.mapping.check.suitability import CheckResult, MapCheck
 from terrafix_tools.mapping.check.text import lines_of
-from terrafix_tools.pages.document import document, facts, header
+from terrafix_tools.pages.document import kit, macros
 from terrafix_tools.pages.pictures import VOID_BGR, data_uri, jpeg_uri
 
+OWN = macros("terrafix_tools/package.html")
 PICTURE_PX = 1400  # longer side of the inlined image
 JPEG_QUALITY = 82
 # BGRA; blue, orange and crimson are distinguishable for the colour-blind, and blind is also the darkest.
@@ -39,12 +41,8 @@ def write_page(checked: CheckResult, out: Path) -> None:
 def page(checked: CheckResult) -> str:
     report = checked.report
     name = Path(report.package).name
-    return document(
-        name,
-        f"{header('Map package', name, _headline(report))}"
-        f'<input type="checkbox" id="sight" checked><label for="sight">Where the camera will see</label>'
-        f"{_svg(checked)}{_legend()}{facts(lines_of(report))}",
-    )
+    head = kit.header("Map package", name, _headline(report))
+    return kit.document(name, "", head, OWN.sight(_svg(checked), _colours()), kit.facts(lines_of(report)))
 
 
 def _headline(report: MapCheck) -> str:
@@ -76,7 +74,9 @@ def _svg(checked: CheckResult) -> str:
         _mission(checked, e_min, n_max, gsd_m),
     ]
     size = f"0 0 {width} {height}"
-    return f'<svg class="package" viewBox="{size}" role="img" aria-label="The map, north up">{"".join(body)}</svg>'
+    return Markup(
+        f'<svg class="package" viewBox="{size}" role="img" aria-label="The map, north up">{"".join(body)}</svg>'
+    )
 
 
 def _mission(checked: CheckResult, e_min_m: float, n_max_m: float, gsd_m: float) -> str:
@@ -91,11 +91,10 @@ def _mission(checked: CheckResult, e_min_m: float, n_max_m: float, gsd_m: float)
     )
 
 
-def _legend() -> str:
-    items = []
+def _colours() -> list[tuple[str, str]]:
+    """CSS colour and meaning of each kind of ground."""
+    found = []
     for sight, words in WORDS.items():
         blue, green, red, alpha = COLOURS[sight]
-        colour = f"rgba({red},{green},{blue},{alpha / 255:.2f})"
-        items.append(f'<span><i class="key cell" style="background:{colour}"></i>{words}</span>')
-    items.append("<span>no colour: less than a whole frame of map</span>")
-    return f'<div class="legend">{"".join(items)}</div>'
+        found.append((f"rgba({red},{green},{blue},{alpha / 255:.2f})", words))
+    return found
