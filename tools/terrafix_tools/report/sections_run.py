@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from terrafix_tools.finalise.before_after import HEADER, Change, kept_line
+from terrafix_tools.before_after import HEADER, Change, kept_line
 from terrafix_tools.pages.charts import HALF_WIDTH, Chart, clock
 from terrafix_tools.pages.document import kit, macros
 from terrafix_tools.pages.pictures import data_uri
@@ -104,11 +104,12 @@ def camera_images(view: FlightView) -> str:
 
 
 def provenance(view: FlightView) -> str:
-    """Versions, map and configuration."""
+    """Versions, map, what the source says of itself, and configuration."""
     versions = view.header.get("versions", {}) or view.summary.get("versions", {})
     rows = [(name, str(value)) for name, value in versions.items() if value]
     chart = view.summary.get("map", {})
     rows += [(f"map {key}", str(chart[key])) for key in ("path", "date", "gsd_m", "checksum") if chart.get(key)]
+    rows += [(f"source, {topic}", text) for topic, text in view.header.get("source", [])]
     config = json.dumps(view.header.get("config", view.summary.get("config", {})), indent=2)
-    about = kit.folded("Versions, map and configuration", kit.facts(rows), kit.pre(config))
+    about = kit.folded("Versions, map, source and configuration", kit.facts(rows), kit.pre(config))
     return kit.section("Provenance", "", about)
