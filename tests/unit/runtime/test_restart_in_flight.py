@@ -14,7 +14,7 @@ from terrafix.runtime import run_dir
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import PREFIX, OwnedRunDir, RunDir
 from terrafix.runtime.run_spec import is_camera, spec_of
-from terrafix.runtime.supervisor import recently_killed_spec
+from terrafix.runtime.supervisor import RunOptions, recently_killed_spec
 
 
 def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
@@ -84,7 +84,7 @@ def test_the_spec_of_a_recently_killed_run_is_found_so_that_the_map_is_not_inspe
     spec = msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5))
 
     def ground_amsl_m(source: str = CAMERA, map_path: Path = package, link: str = "udpin:h:1") -> float | None:
-        before = recently_killed_spec(source=source, map_path=map_path, link=link, out_dir=out, configs=[])
+        before = recently_killed_spec(RunOptions(source=source, map_path=map_path, link=link, out_dir=out))
         return None if before is None else before.ground_amsl_m
 
     assert ground_amsl_m() is None
