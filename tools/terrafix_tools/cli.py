@@ -40,6 +40,7 @@ MODULES = {
     "status": "terrafix_tools.status.cli:status",
     "hint": "terrafix_tools.hint.cli:hint",
     "log": "terrafix_tools.log.cli:app",
+    "source": "terrafix_tools.source.cli:app",
     "files": "terrafix_tools.files.cli:files",
     "models": "terrafix_tools.models.cli:app",
     "map": "terrafix_tools.mapping.cli:app",

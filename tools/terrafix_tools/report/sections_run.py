@@ -112,13 +112,14 @@ def camera_images(view: FlightView) -> str:
 
 
 def provenance(view: FlightView) -> str:
-    """Versions, map and configuration."""
+    """Versions, map, what the source says of itself, and configuration."""
     versions = view.header.get("versions", {}) or view.summary.get("versions", {})
     rows = [(name, str(value)) for name, value in versions.items() if value]
     chart = view.summary.get("map", {})
     rows += [(f"map {key}", str(chart[key])) for key in ("path", "date", "gsd_m", "checksum") if chart.get(key)]
+    rows += [(f"source, {topic}", text) for topic, text in view.header.get("source", [])]
     config = json.dumps(view.header.get("config", view.summary.get("config", {})), indent=2)
     return (
-        f"<h2>Provenance</h2><details><summary>Versions, map and configuration</summary>{table(rows)}"
+        f"<h2>Provenance</h2><details><summary>Versions, map, source and configuration</summary>{table(rows)}"
         f"<pre>{escape(config)}</pre></details>"
     )
