@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from terrafix.core.config import Config, LinkSection, Map, Source
+from terrafix.core.config import Config, LinkSection, Map, SourceSection
 from terrafix.processes import PROCESSES
 from terrafix.runtime import run_dir
 from terrafix.runtime.progress_stamp import Progress
@@ -80,7 +80,7 @@ def test_the_spec_of_a_recently_killed_run_is_found_so_that_the_map_is_not_inspe
 ) -> None:
     monkeypatch.setattr(run_dir, "SHM", tmp_path)
     package, out = tmp_path / "a.gpkg", tmp_path / "out"
-    config = Config(map=Map(path=str(package)), source=Source(path=CAMERA), link=LinkSection(device="udpin:h:1"))
+    config = Config(map=Map(path=str(package)), source=SourceSection(path=CAMERA), link=LinkSection(device="udpin:h:1"))
     spec = msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5))
 
     def ground_amsl_m(source: str = CAMERA, map_path: Path = package, link: str = "udpin:h:1") -> float | None:
@@ -92,7 +92,7 @@ def test_the_spec_of_a_recently_killed_run_is_found_so_that_the_map_is_not_inspe
     assert ground_amsl_m() == 412.5
     assert ground_amsl_m(map_path=tmp_path / "b.gpkg") is None
     assert ground_amsl_m(link="udpin:h:2") is None
-    config = msgspec.structs.replace(config, source=Source(path=str(tmp_path)))
+    config = msgspec.structs.replace(config, source=SourceSection(path=str(tmp_path)))
     stale.spec.write_bytes(msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5)))
     assert ground_amsl_m(source=str(tmp_path)) is None, "a recorded source is not resumed"
     stale.spec.write_bytes(b'{"of another version": 1}')
