@@ -15,7 +15,7 @@ from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffD
 from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
 from terrafix.estimator.integrity.signed_innovations import SignedInnovations
-from terrafix.estimator.integrity.time_offset import Turn
+from terrafix.estimator.integrity.turn_comparison import Turn
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning, DeadReckoningAid

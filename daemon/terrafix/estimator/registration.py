@@ -10,7 +10,7 @@ import numpy as np
 
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState, FrameInput
-from terrafix.estimator.integrity.time_offset import Turn
+from terrafix.estimator.integrity.turn_comparison import Turn
 from terrafix.estimator.measurements.attitude_height import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.odometry import GatedOdometry, KeyframeMotion
 from terrafix.estimator.models.motion_model import STATIONARY_M, MotionIncrement, fuse_odometry_increment

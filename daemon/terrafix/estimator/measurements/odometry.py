@@ -15,7 +15,7 @@ from terrafix.estimator.integrity.fragments import Fragment, MotionEvidence
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture
-from terrafix.estimator.integrity.time_offset import Turn
+from terrafix.estimator.integrity.turn_comparison import Turn
 from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.ground_plane_motion import plane_motion

@@ -202,3 +202,8 @@ class _Series:
 def _unwrapped(angles: np.ndarray) -> np.ndarray:
     """(3, N). np.unwrap is slow, also where nothing wraps."""
     return np.unwrap(angles, axis=1) if np.abs(np.diff(angles, axis=1)).max() >= np.pi else angles
+
+
+def rotations(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """R_w_b (N, 3, 3) of N attitudes."""
+    return np.stack([rotate_to_world([*axis], yaw, pitch, roll) for axis in np.eye(3)], axis=2)

@@ -37,7 +37,7 @@ class Turn:
     yaw_rad: float
 
 
-class TimeOffset:
+class TurnComparison:
     """``applied_s``: the offset to subtract from the time stamps of frames; 0 until it is significant."""
 
     def __init__(self) -> None:
