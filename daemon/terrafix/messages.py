@@ -30,6 +30,9 @@ class SourceLabel(StrEnum):
     SATELLITE_ANCHORED = "satellite_anchored"
     VISUAL_PROPAGATED = "visual_propagated"  # visual odometry since the last map match
     DEAD_RECKONED = "dead_reckoned"  # neither map match nor odometry: prediction with growing covariance
+    # No map match was fused in this flight, and no start is known to SEARCH_START_SIGMA_M: the position is the centre
+    # of a prior, and no consumer shows or uses it.
+    NOT_PLACED = "not_placed"
 
 
 class CovarianceMode(StrEnum):
@@ -462,7 +465,8 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     frame_id: int
     lat_deg: float
     lon_deg: float
-    alt_amsl_m: float
+    alt_amsl_m: float  # above the ground at the start where ``amsl_known`` is False
+    amsl_known: bool = True  # False: neither start nor DEM gives an elevation
     agl_m: float
     velocity_enu_mps: Vec3
     velocity_sigma_mps: float  # 1-sigma in the worst direction
@@ -581,7 +585,7 @@ class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
     frame_id: int
     lat_deg: float
     lon_deg: float
-    alt_amsl_m: float
+    alt_amsl_m: float | None  # None: no elevation is known
     sigma_e_m: float
     sigma_n_m: float
     cov_en_m2: float = 0.0

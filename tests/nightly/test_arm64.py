@@ -26,7 +26,7 @@ from emulated_subreaper import as_subreaper
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import MapMatch, NavEstimate, Verdict
 from terrafix.recorder.reader import read_flight
-from terrafix_tools.chaos.shuttle import shuttle_in
+from terrafix_lab.chaos.shuttle import shuttle_in
 
 pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.real_time]
 
@@ -51,14 +51,14 @@ TERRAFIX = "/opt/terrafix/venv/bin/terrafix"
 UNIT_WORDS = ("run", "--config", "/etc/terrafix/terrafix.toml", "--out", "/var/lib/terrafix/%b")  # of ExecStart=
 IMPORTS = """
 import importlib, importlib.metadata, importlib.util, pkgutil, platform
-import numpy, terrafix, terrafix_engines, terrafix_tools
+import numpy, terrafix, terrafix_engines, terrafix_lab, terrafix_tools
 owners = importlib.metadata.packages_distributions().items()
 packages = sorted(name for name, of in owners if name.isidentifier() and not {"pip", "setuptools"} & {*of})
 packages = [name for name in packages if importlib.util.find_spec(name)]  # some say that they have more than they have
 absent = set()
 for name in packages:
     importlib.import_module(name)
-ours = (terrafix, terrafix_engines, terrafix_tools)
+ours = (terrafix, terrafix_engines, terrafix_lab, terrafix_tools)
 found = [m.name for p in ours for m in pkgutil.walk_packages(p.__path__, p.__name__ + ".")]
 modules = [name for name in found if not name.endswith("__main__")]
 for name in modules:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from booted_system import NAMES, Booted, Surroundings, do, wait_until
-from terrafix_tools.chaos.shuttle import shuttle_in
+from terrafix_lab.chaos.shuttle import shuttle_in
 
 pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.real_time]
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from terrafix.messages import SearchStep
-from terrafix_tools.accept.faults import flight_edits
-from terrafix_tools.accept.flight import open_flight
-from terrafix_tools.accept.measuring import measures
-from terrafix_tools.accept.measuring.evidence import gather
-from terrafix_tools.accept.measuring.results import Marks
+from terrafix_lab.accept.faults import flight_edits
+from terrafix_lab.accept.flight import open_flight
+from terrafix_lab.accept.measuring import measures
+from terrafix_lab.accept.measuring.evidence import gather
+from terrafix_lab.accept.measuring.results import Marks
 from terrafix_tools.replay import replay
 
 FRAMES = 85

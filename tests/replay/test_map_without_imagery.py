@@ -6,10 +6,10 @@ import pytest
 
 from terrafix.messages import MapMatch, Verdict
 from terrafix.recorder.reader import read_flight
+from terrafix_lab.sim.flights.make import FlightOptions, make
+from terrafix_lab.sim.world.map_content import MapContent
 from terrafix_tools.evaluate import evaluate
 from terrafix_tools.replay import replay
-from terrafix_tools.sim.flights.make import FlightOptions, make
-from terrafix_tools.sim.world.map_content import MapContent
 
 pytestmark = pytest.mark.slow
 

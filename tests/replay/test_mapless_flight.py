@@ -10,7 +10,7 @@ from mapless_flight import Flown, darkened, fly
 from terrafix.core.gate import GATE
 from terrafix.messages import Verdict
 from terrafix.vision.sources import Shot
-from terrafix_tools.sim.flights.make import FlightOptions, make
+from terrafix_lab.sim.flights.make import FlightOptions, make
 
 SIDE_M, LAPS, AGL_M = 500.0, 2, 100.0
 CENTRE = (48.152, 14.349)  # degrees, of the generated place

@@ -28,8 +28,8 @@ from terrafix.messages import (
 )
 from terrafix.recorder.provenance import header
 from terrafix.recorder.writer import FlightWriter
-from terrafix_tools.accept.measuring.evidence import Evidence, gather
-from terrafix_tools.accept.measuring.results import Marks
+from terrafix_lab.accept.measuring.evidence import Evidence, gather
+from terrafix_lab.accept.measuring.results import Marks
 from terrafix_tools.estimates import ESTIMATES, RowTable, write_rows
 from terrafix_tools.evaluate import Truth
 

@@ -18,14 +18,14 @@ import numpy as np
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, NavEstimate
 from terrafix.processes import PROCESSES
-from terrafix_tools.chaos.camera import Look, StreamedCamera, altered, camera_toml
-from terrafix_tools.chaos.scene import Scene
-from terrafix_tools.chaos.verdict import back_s
+from terrafix_lab.chaos.camera import Look, StreamedCamera, altered, camera_toml
+from terrafix_lab.chaos.scene import Scene
+from terrafix_lab.chaos.verdict import back_s
+from terrafix_lab.sim.autopilot.course import PeerState
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.autopilot.peer import AutopilotPeer
+from terrafix_lab.sim.camera.stream import FrameStream
 from terrafix_tools.score import longest_gap_s
-from terrafix_tools.sim.autopilot.course import PeerState
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.autopilot.peer import AutopilotPeer
-from terrafix_tools.sim.camera.stream import FrameStream
 
 INSTALL_S, WAIT_S = 1800.0, 300.0  # limits; the machine may be busy
 STEADY_S = 1.0  # with a fix before each fault

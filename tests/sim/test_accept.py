@@ -12,13 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from terrafix_tools.accept.fly import Job, fly
-from terrafix_tools.accept.measuring.results import JudgedRow, Verdict
+from terrafix_lab.accept.fly import Job, fly
+from terrafix_lab.accept.measuring.results import JudgedRow, Verdict
 
 FRAMES = 60  # of each flight, half of those of --quick
-SHORT = (
-    f"from terrafix_tools.accept import run; run.QUICK_FRAMES = {FRAMES}; from terrafix_tools.cli import main; main()"
-)
+SHORT = f"from terrafix_lab.accept import run; run.QUICK_FRAMES = {FRAMES}; from terrafix_tools.cli import main; main()"
 COMMAND = [sys.executable, "-c", SHORT, "accept"]
 SCENARIOS = ("baseline", "foreign frame", "350 m outlier fix")
 

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from terrafix_tools.chaos.faults import killed
-from terrafix_tools.chaos.run import fly_cell
-from terrafix_tools.chaos.scene import Phase, Scene, course_of
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.flights.folder import flight_over, write_flight
-from terrafix_tools.sim.flights.scene import scene_of_place
-from terrafix_tools.sim.world import place as world
-from terrafix_tools.sim.world.mapped import CAMERA_SEASON, write_map
+from terrafix_lab.chaos.faults import killed
+from terrafix_lab.chaos.run import fly_cell
+from terrafix_lab.chaos.scene import Phase, Scene, course_of
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.flights.folder import flight_over, write_flight
+from terrafix_lab.sim.flights.scene import scene_of_place
+from terrafix_lab.sim.world import place as world
+from terrafix_lab.sim.world.mapped import CAMERA_SEASON, write_map
 
 pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 SEED, SIDE_M, AGL_M, DURATION_S = 3, 700.0, 90.0, 24.0

@@ -12,14 +12,14 @@ import pytest
 from typer.testing import CliRunner
 
 from terrafix.core.errors import OutputError
+from terrafix_lab.sim.autopilot.parameters import Gps, Kind
+from terrafix_lab.sim.closed_loop.flight import Conditions, plan_over
+from terrafix_lab.sim.closed_loop.loop import Flown, fly
+from terrafix_lab.sim.flights.scene import Scene, scene_of_world
+from terrafix_lab.sim.sensors.gnss_events import Drag, Jam, Outage
+from terrafix_lab.sim.world import place as world
 from terrafix_tools.cli import app, main
 from terrafix_tools.mapping.build import build
-from terrafix_tools.sim.autopilot.parameters import Gps, Kind
-from terrafix_tools.sim.closed_loop.flight import Conditions, plan_over
-from terrafix_tools.sim.closed_loop.loop import Flown, fly
-from terrafix_tools.sim.flights.scene import Scene, scene_of_world
-from terrafix_tools.sim.sensors.gnss_events import Drag, Jam, Outage
-from terrafix_tools.sim.world import place as world
 
 COMMAND = ["terrafix", "sim", "fly"]
 Place = tuple[Scene, Path]

@@ -17,9 +17,9 @@ from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge, open_edge
 from terrafix.link.mavlink.transport import Address
 from terrafix.link.node import LinkNode
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.sitl.firmware import BINARY_VARIABLE
-from terrafix_tools.sim.sitl.setup import write_parameters
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.sitl.firmware import BINARY_VARIABLE
+from terrafix_lab.sim.sitl.setup import write_parameters
 
 _SETTING = os.environ.get(BINARY_VARIABLE, "")
 # The variable may name the plane's binary; the copter's is in the same folder.

@@ -2,33 +2,20 @@
 
 import contextlib
 import errno
+import importlib
+import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+import typer.core
+import typer.main
 
 from terrafix import __version__
 from terrafix.core.errors import OutputError, TerrafixError, UsageError
-from terrafix_tools.accept.cli import accept
-from terrafix_tools.chaos.cli import chaos
-from terrafix_tools.compare.cli import compare
-from terrafix_tools.console.cli import serve
-from terrafix_tools.console.flight_cli import app as flight_app
-from terrafix_tools.files.cli import files
-from terrafix_tools.finalise.cli import finalise
-from terrafix_tools.fleet.cli import app as fleet_app
-from terrafix_tools.hint.cli import CONTEXT, hint
-from terrafix_tools.locate.cli import locate
-from terrafix_tools.log.cli import app as log_app
-from terrafix_tools.mapping.cli import app as map_app
-from terrafix_tools.models.cli import app as models_app
-from terrafix_tools.montecarlo.cli import montecarlo
-from terrafix_tools.preflight.cli import preflight
-from terrafix_tools.sim.cli import app as sim_app
-from terrafix_tools.status.cli import status
 
 if TYPE_CHECKING:
     from terrafix.runtime.fork_server import ForkServer
@@ -41,24 +28,62 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 # and of the extra `console`
 CONSOLE_PACKAGES = ("fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "python_multipart", "pydantic")
 
-app = typer.Typer(no_args_is_help=True)
-app.add_typer(map_app, name="map")
-app.add_typer(models_app, name="models")
-app.add_typer(log_app, name="log")
-app.add_typer(fleet_app, name="fleet")
-app.add_typer(flight_app, name="flight")
-app.add_typer(sim_app, name="sim")
-app.command()(accept)
-app.command()(chaos)
-app.command()(compare)
-app.command()(files)
-app.command()(finalise)
-app.command()(locate)
-app.command()(preflight)
-app.command()(serve)
-app.command()(status)
-app.command(context_settings=CONTEXT)(hint)
-app.command()(montecarlo)
+# Commands of modules of their own: a function, or a Typer app with commands below it. Imported when they are called, so
+# that a start in flight is fast. The lab is named here and imported by nothing: it may not be installed.
+MODULES = {
+    "preflight": "terrafix_tools.preflight.cli:preflight",
+    "status": "terrafix_tools.status.cli:status",
+    "hint": "terrafix_tools.hint.cli:hint",
+    "log": "terrafix_tools.log.cli:app",
+    "files": "terrafix_tools.files.cli:files",
+    "models": "terrafix_tools.models.cli:app",
+    "map": "terrafix_tools.mapping.cli:app",
+    "finalise": "terrafix_tools.finalise.cli:finalise",
+    "compare": "terrafix_tools.compare.cli:compare",
+    "locate": "terrafix_tools.locate.cli:locate",
+    "fleet": "terrafix_tools.fleet.cli:app",
+    "serve": "terrafix_tools.console.cli:serve",
+    "flight": "terrafix_tools.console.flight_cli:app",
+    "demo": "terrafix_lab.sim.demo.cli:demo",
+    "sim": "terrafix_lab.sim.cli:app",
+    "accept": "terrafix_lab.accept.cli:accept",
+    "montecarlo": "terrafix_lab.montecarlo.cli:montecarlo",
+    "chaos": "terrafix_lab.chaos.cli:chaos",
+    "bench": "terrafix_lab.bench.cli:bench",
+}
+
+
+def _load(name: str) -> Any:
+    """The command ``name`` of MODULES. Raises ModuleNotFoundError where its package is not installed."""
+    path, attribute = MODULES[name].split(":")
+    module = importlib.import_module(path)
+    loaded = getattr(module, attribute)
+    holder = typer.Typer(add_completion=False)
+    if isinstance(loaded, typer.Typer):
+        holder.add_typer(loaded, name=name)
+    else:
+        holder.command(name, context_settings=getattr(module, "CONTEXT", None))(loaded)
+    return typer.main.get_group(holder).commands[name]
+
+
+def _is_installed(path: str) -> bool:
+    try:
+        return importlib.util.find_spec(path.split(":")[0]) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands of this module and those of MODULES; the help leaves out what is not installed."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), *(name for name, path in MODULES.items() if _is_installed(path))]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        return _load(cmd_name) if cmd_name in MODULES else super().get_command(ctx, cmd_name)
+
+
+app = typer.Typer(no_args_is_help=True, cls=_Commands)
 
 StartOption = Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")]
 ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")]
@@ -226,39 +251,6 @@ def report(
     from terrafix_tools.report.page import report as run_report
 
     typer.echo(run_report(folder, truth, map_path))
-
-
-@app.command()
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for all output of the demo.")] = Path("out/demo"),
-    seed: Annotated[int, typer.Option(help="Seed of the world and of the noise.")] = 1,
-    duration: Annotated[float, typer.Option(help="Seconds of flight.")] = 90.0,
-    console: Annotated[
-        bool, typer.Option("--console", help="Show the flight live in the browser; Ctrl-C ends the console.")
-    ] = False,
-) -> None:
-    """Fly over a generated world with the real processes and a simulated autopilot, and write a report."""
-    from terrafix_tools.sim.demo.command import demo as run_demo
-
-    raise typer.Exit(run_demo(out, seed=seed, duration_s=duration, with_console=console))
-
-
-@app.command()
-def bench(
-    data: Annotated[Path, typer.Option(help="Folder with flights/ and models/.")] = Path("../shared/data"),
-    out: Annotated[Path, typer.Option(help="JSON to write.")] = Path("out/bench.json"),
-    flight: Annotated[
-        list[str] | None, typer.Option(help="Name in flights/, or 'generated'; may be given several times.")
-    ] = None,
-    frames: Annotated[int | None, typer.Option(help="Use at most this many frames of each flight.")] = None,
-    xfeat: Annotated[bool, typer.Option(help="Also run with XFeat, when models/xfeat.onnx exists.")] = True,
-    growing: Annotated[bool, typer.Option(help="Also run larger maps (to 100 km2) and longer flights.")] = True,
-    page: Annotated[Path | None, typer.Option(help="Markdown page to write, with a picture in images/.")] = None,
-) -> None:
-    """Measure time, memory and accuracy next to baselines of the same run, and how they scale."""
-    from terrafix_tools.bench.run import bench as run_bench
-
-    run_bench(data, out, flights=flight, frames=frames, xfeat=xfeat, growing=growing, page=page)
 
 
 def _printable(text: str) -> str:

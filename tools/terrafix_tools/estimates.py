@@ -9,7 +9,7 @@ from typing import TextIO
 
 from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import rot_from_quat, yaw_of
-from terrafix.messages import Frame, Message, NavEstimate, Refinement
+from terrafix.messages import Frame, Message, NavEstimate, Refinement, SourceLabel
 
 
 @dataclass
@@ -89,10 +89,12 @@ class RowTable:
 
     @staticmethod
     def _estimate(row: Row, estimate: NavEstimate) -> None:
-        row.lat_deg, row.lon_deg = estimate.lat_deg, estimate.lon_deg
-        row.alt_amsl_m, row.agl_m = estimate.alt_amsl_m, estimate.agl_m
-        row.sigma_e_m, row.sigma_n_m = math.sqrt(estimate.cov[0]), math.sqrt(estimate.cov[7])
-        row.cov_en_m2 = estimate.cov[1]
+        placed = estimate.source_label is not SourceLabel.NOT_PLACED
+        row.lat_deg, row.lon_deg = (estimate.lat_deg, estimate.lon_deg) if placed else (None, None)
+        row.alt_amsl_m, row.agl_m = estimate.alt_amsl_m if estimate.amsl_known else None, estimate.agl_m
+        row.sigma_e_m = math.sqrt(estimate.cov[0]) if placed else None
+        row.sigma_n_m = math.sqrt(estimate.cov[7]) if placed else None
+        row.cov_en_m2 = estimate.cov[1] if placed else None
         row.yaw_deg = yaw_deg_of(estimate)
         row.source_label, row.covariance_mode = str(estimate.source_label), str(estimate.covariance_mode)
         row.anchor_age_ms = estimate.last_anchor_age_ms

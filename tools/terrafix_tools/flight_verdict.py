@@ -10,7 +10,7 @@ from typing import Any
 
 from terrafix.link.integrity.fix_type import DEGRADATION_LEVELS, MAX_HORIZONTAL_SIGMA_M
 from terrafix.link.pilot_text.statustext import fault_text
-from terrafix.messages import CalibrationFault, MeasurementVerdict, Origin, Verdict
+from terrafix.messages import CalibrationFault, MeasurementVerdict, Origin, SourceLabel, Verdict
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import NS, Row, RowTable
 
@@ -84,8 +84,9 @@ def flight_verdict(
     rejected = (
         START_CONTRADICTS_MAP if verdict_counts.get("start") else _rejected_matches(verdict_counts.get("map", {}))
     )
-    start_s = rows[0].t_s if rows else 0.0
-    distrust = [rejected or _distrust_reason(row, start_s, faulty_spans) for row in rows]
+    confirmed = any(row.anchor_age_ms is not None and row.anchor_age_ms >= 0 for row in rows)
+    unconfirmed_until_s = rows[0].t_s + MAX_UNCONFIRMED_S if confirmed else -math.inf
+    distrust = [rejected or _distrust_reason(row, unconfirmed_until_s, faulty_spans) for row in rows]
     spans = []
     for trusted, group in groupby(zip(rows, distrust, strict=True), key=lambda pair: not pair[1]):
         if trusted:
@@ -118,18 +119,20 @@ def verdict_of(folder: Path) -> FlightVerdict:
     return replace(found, spans=[(a - (zero_s or 0.0), b - (zero_s or 0.0)) for a, b in found.spans])
 
 
-def _distrust_reason(row: Row, start_s: float, faulty_spans: list[tuple[float, float, str]]) -> str:
-    """Returns the reason not to trust the row; empty when it can be trusted."""
+def _distrust_reason(row: Row, unconfirmed_until_s: float, faulty_spans: list[tuple[float, float, str]]) -> str:
+    """Returns the reason not to trust the row; empty when it can be trusted. ``unconfirmed_until_s``: time until which
+    it may rest on the start of the flight alone.
+    """
     for from_s, to_s, reason in faulty_spans:
         if from_s <= row.t_s < to_s:
             return reason
     if not row.localised or row.sigma_e_m is None or row.sigma_n_m is None:
-        return "no position"
+        return "not found on the map" if row.source_label == SourceLabel.NOT_PLACED else "no position"
     if math.hypot(row.sigma_e_m, row.sigma_n_m) / math.sqrt(2.0) > MAX_HORIZONTAL_SIGMA_M:
         return f"claims worse than {MAX_HORIZONTAL_SIGMA_M:.0f} m"
     age_ms = row.anchor_age_ms
     if age_ms is None or age_ms < 0:
-        return "" if row.t_s - start_s <= MAX_UNCONFIRMED_S else "no map match has confirmed the start"
+        return "" if row.t_s <= unconfirmed_until_s else "no map match has confirmed the start"
     return "" if age_ms <= MAX_UNANCHORED_S * 1e3 else f"no map match for over {MAX_UNANCHORED_S:.0f} s"
 
 

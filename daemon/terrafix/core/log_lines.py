@@ -149,6 +149,8 @@ def _initial_position(initial: InitialPosition) -> LogEntry:
 
 def _estimate(estimate: NavEstimate) -> LogEntry:
     fields = {"source": estimate.source_label.value, "frame": estimate.frame_id}
+    if estimate.source_label is SourceLabel.NOT_PLACED:
+        return LogEntry("warning", "estimator", "not placed: no map match yet, and no known start", fields)
     if estimate.source_label is SourceLabel.DEAD_RECKONED:
         return LogEntry("warning", "estimator", "dead reckoning", fields)
     return LogEntry("info", "estimator", "position from images", fields)
@@ -254,12 +256,13 @@ _DESCRIBE: dict[type[Message], Callable[[Any], LogEntry | None]] = {
     LogLine: _log_line,
 }
 
+NOT_FROM_IMAGES = (SourceLabel.DEAD_RECKONED, SourceLabel.NOT_PLACED)
 # Of these only a change of state is a line: (of what, the state, the state before the first message).
 _STATE: dict[type[Message], Callable[[Any], tuple[Any, Any, Any]]] = {
     Frame: lambda m: (None, m.error not in ("", OVERTAKEN), False),
     Odometry: lambda m: (None, m.verdict is Verdict.ACCEPTED, True),
     InitialPosition: lambda m: (None, (m.verdict, m.lat_deg is None), None),
-    NavEstimate: lambda m: (None, m.source_label is SourceLabel.DEAD_RECKONED, False),
+    NavEstimate: lambda m: (None, m.source_label if m.source_label in NOT_FROM_IMAGES else None, None),
     GpsInput: lambda m: (None, m.fix_type >= FIX_3D, None),
     GnssVerdict: lambda m: (m.receiver, m.state, GnssState.UNKNOWN),
     WallClock: lambda m: (None, m.source, None),

@@ -86,10 +86,14 @@ class Estimator:
         return self._map_update.map_sigma_m
 
     def refine(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-        """After landing: frame -> position (3,) and covariance (3, 3), by all that was measured in the flight."""
+        """After landing: frame -> position (3,) and covariance (3, 3), by all that was measured in the flight; only of
+        frames that a place stands behind."""
         result, state = {}, self.state
         jacobians = np.array(state.principal_point_jacobians).reshape(-1, 2, 2)
-        for frame, jacobian, p_m, cov in zip(state.frames, jacobians, *state.graph.refine(), strict=True):
+        frames = zip(state.frames, jacobians, *state.graph.refine(), strict=True)
+        for node, (frame, jacobian, p_m, cov) in enumerate(frames):
+            if state.first_placed_node is None or node < state.first_placed_node:
+                continue
             if np.isfinite(p_m).all() and np.isfinite(cov).all():
                 if frame in self._ambiguous:
                     cov[:2, :2] += self._ambiguous[frame]

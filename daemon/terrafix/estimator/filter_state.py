@@ -114,6 +114,9 @@ class FilterState:
         self.yaw_gauge: YawGauge | None = None
         self.last: FrameState | None = None  # newest frame
         self.last_fix_s: float | None = None
+        # First node of the flight that a place stands behind: a start that is known, or a map match of its graph.
+        self.first_placed_node: int | None = None
+        self.first_node = 0  # of the present graph, since the last reset
         self.last_fused_s = 0.0  # time of the newest frame with fused odometry or an accepted map match
         self.has_height = False
         self.began_s = 0.0
@@ -134,6 +137,16 @@ class FilterState:
     def covariance(self, node: int) -> np.ndarray:
         """Covariance (6, 6) of C_node, tangent order."""
         return self.covariances.pose(node)
+
+    @property
+    def is_placed(self) -> bool:
+        """A place stands behind the newest estimate: a start that is known, or a map match."""
+        return self.first_placed_node is not None
+
+    def on_placed(self) -> None:
+        """A place stands behind all nodes of the present graph."""
+        if self.first_placed_node is None:
+            self.first_placed_node = self.first_node
 
     def add_factors(self, node: int, *factors: gtsam.NonlinearFactor) -> None:
         """Factors of the variables of ``node``, of a measurement that was accepted."""
@@ -236,6 +249,11 @@ class FilterState:
         both = scale_sigma(self.origin.camera)
         log_scale = float(self.graph.state(node).calibration[LOG_HEIGHT_SCALE])
         return focal_scale(self.origin.camera, log_scale), focal * BAROMETER_SCALE_SIGMA / both
+
+    @property
+    def amsl_known(self) -> bool:
+        """Heights are above mean sea level; else above the ground at the start, whose elevation is unknown."""
+        return self.origin.ground_amsl_m is not None or self.terrain.has_dem
 
     def amsl(self, frame: FrameState) -> tuple[float, float]:
         """Height of the camera AMSL [m], and its 1-sigma beyond the covariance of the graph. Without a DEM the graph

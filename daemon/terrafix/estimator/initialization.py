@@ -74,7 +74,7 @@ def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior, *, j
     state.keep_keyframes(state.graph.window)
     state.left.clear()  # the new graph may lie elsewhere
     state.motion_cov = prior.motion_cov
-    node = state.graph.start(t_s, prior)
+    node = state.first_node = state.graph.start(t_s, prior)
     state.covariances.started(node, prior)
     state.continuity = FrameContinuity(KeyframeSubstitution.of(state.newest_odometry))
     fragment = Fragment(t_s, state.newest_odometry.fragment_id, confirmed=True, joined=joined)
@@ -220,6 +220,8 @@ class Initializer:
         state.has_height = self._has_height
         assert self._prior is not None
         state.began_s = self._prior.t_s
+        if self._prior.placed:
+            state.on_placed()
         return start_at(state, frame, initial.at_m, initial.sigma_m, initial.calibration), initial
 
     def initial_pose(self, t_s: float, attitude: Attitude, terrain: Terrain) -> InitialPose:

@@ -198,6 +198,7 @@ class MapUpdate:
         state.image_jump = None
         state.last_fused_s = max(state.last_fused_s, t_s)
         state.last_fix_s = self._fixes.newest_s
+        state.on_placed()
         self.hypotheses.on_match_accepted()
         self.map_sigma_m = match.map_sigma_m
         last = state.refresh_newest()

@@ -106,13 +106,14 @@ def estimate_of(
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         alt_amsl_m=claim.amsl_m,
+        amsl_known=state.amsl_known,
         agl_m=scale * estimator.terrain.height_above_m(p),
         velocity_enu_mps=(float(v[0]), float(v[1]), scale * float(v[UP])),
         velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(frame.velocity_cov)[-1])),  # of the worst direction
         q_w_b=quat_from_rot(state.body(frame)),
         cov=tuple(float(c) for c in claim.cov.ravel()),
         map_sigma_m=estimator.map_sigma_m,
-        source_label=_source(age_ms, tracked=tracked and connected),
+        source_label=_source(age_ms, tracked=tracked and connected) if state.is_placed else SourceLabel.NOT_PLACED,
         covariance_mode=state.mode,
         last_anchor_age_ms=age_ms,
         emitted_at_ns=max(t_ns, round(frame.t_s * 1e9)),  # the live executor sets the time of publishing here
@@ -151,7 +152,7 @@ def refinement_of(estimator: Estimator, axes: LocalFrame, ended: SourceEnded) ->
                 frame_id=frame_id,
                 lat_deg=lat_deg,
                 lon_deg=lon_deg,
-                alt_amsl_m=float(p[UP]),
+                alt_amsl_m=float(p[UP]) if estimator.state.amsl_known else None,
                 sigma_e_m=float(np.sqrt(cov[0, 0] + map_var)),
                 sigma_n_m=float(np.sqrt(cov[1, 1] + map_var)),
             )

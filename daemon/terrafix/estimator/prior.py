@@ -25,6 +25,7 @@ from terrafix.messages import (
     Message,
     NavEstimate,
     Origin,
+    SourceLabel,
     Vec2,
 )
 from terrafix.runtime.checkpoint import CheckpointFile
@@ -69,7 +70,7 @@ class CalibrationPrior:
 class NavPrior:
     """Position ``at_m`` (2,), east and north, at ``t_s`` with ``sigma_m``; ``velocity_mps`` (2,) with its 1-sigma (each
     axis); ``yaw_rad``: heading of the vehicle, None: unknown. ``learnt``, ``ground``, ``lens``: calibration, ground and
-    lens of a checkpoint."""
+    lens of a checkpoint. ``placed``: a place stands behind the position; False: it is the centre of an area."""
 
     t_s: float
     at_m: np.ndarray
@@ -80,12 +81,14 @@ class NavPrior:
     learnt: CalibrationPrior | None = None
     ground: CheckpointGround | None = None
     lens: LensEstimate | None = None
+    placed: bool = True
 
     @classmethod
     def start(cls, origin: Origin, t_s: float) -> "NavPrior":
         """Prior at the start coordinate at ``t_s``, with unknown velocity."""
         sigma_m = min(max(origin.start_sigma_m, 1.0), SEARCH_START_SIGMA_M)
-        return cls(t_s, np.zeros(2), sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
+        placed = origin.start_sigma_m <= SEARCH_START_SIGMA_M
+        return cls(t_s, np.zeros(2), sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]), placed=placed)
 
     @classmethod
     def at_initial_position(cls, initial: InitialPosition, frame: LocalFrame, t_s: float) -> "NavPrior | None":
@@ -94,7 +97,8 @@ class NavPrior:
         if initial.lat_deg is None or initial.lon_deg is None or initial.sigma_m is None:
             return None
         at_m = np.array(frame.to_local(initial.lat_deg, initial.lon_deg))
-        return cls(t_s, at_m, initial.sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]))
+        placed = initial.sigma_m <= SEARCH_START_SIGMA_M
+        return cls(t_s, at_m, initial.sigma_m, np.zeros(2), float(MAX_SPEED_SIGMA_MPS[0]), placed=placed)
 
     @classmethod
     def of(cls, checkpoint: EstimatorCheckpoint, frame: LocalFrame, camera: Camera) -> "NavPrior":
@@ -110,8 +114,18 @@ class NavPrior:
         if calibration is not None and estimate.t_ns - calibration.t_ns <= MAX_CALIBRATION_AGE_NS:
             cov = np.array(calibration.cov).reshape(CALIBRATION_SIZE, CALIBRATION_SIZE)
             learnt = CalibrationPrior(calibration.t_ns * 1e-9, np.array(calibration.state), cov)
+        placed = estimate.source_label is not SourceLabel.NOT_PLACED
         return cls(
-            t_s, at_m, sigma_m, velocity_mps, estimate.velocity_sigma_mps, yaw_rad, learnt, checkpoint.ground, lens
+            t_s,
+            at_m,
+            sigma_m,
+            velocity_mps,
+            estimate.velocity_sigma_mps,
+            yaw_rad,
+            learnt,
+            checkpoint.ground,
+            lens,
+            placed,
         )
 
     def path_until(self, t_s: float, yaw_rad: float | None) -> tuple[np.ndarray, float]:

@@ -47,6 +47,7 @@ class SmootherNode:
         self._enabled = enabled
         self._graph = graph or KeyframeGraph()
         self._axes: LocalFrame | None = None
+        self._amsl_known = False  # the Origin has the elevation of the ground
         self._waiting: list[Message] = []  # for the Origin, which comes from another process
         self._solved: dict[int, Placed] = {}
         self._published: dict[int, np.ndarray] = {}  # frame -> (2, 3): position, and the columns of its covariance
@@ -83,7 +84,7 @@ class SmootherNode:
         axes = LocalFrame(origin.lat_deg, origin.lon_deg)
         if self._axes is not None:  # published again, after a restart of vision
             return
-        self._axes = axes
+        self._axes, self._amsl_known = axes, origin.ground_amsl_m is not None
         waiting, self._waiting = self._waiting, []
         for message in waiting:
             yield from self._take(message)
@@ -213,7 +214,7 @@ class SmootherNode:
             frame_id=frame_id,
             lat_deg=lat_deg,
             lon_deg=lon_deg,
-            alt_amsl_m=float(placed.pose.translation()[2]),
+            alt_amsl_m=float(placed.pose.translation()[2]) if self._amsl_known else None,
             sigma_e_m=float(np.sqrt(cov[0, 0])),
             sigma_n_m=float(np.sqrt(cov[1, 1])),
             cov_en_m2=float(cov[0, 1]),

@@ -25,14 +25,14 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
+from terrafix_lab.montecarlo.flown import imu_of
+from terrafix_lab.sim.interfaces import Readings
+from terrafix_lab.sim.sensors.suite import VehicleSensors
+from terrafix_lab.sim.true_messages import first_odometry, map_match, seen_from
+from terrafix_lab.sim.vehicle.plane import Plane
+from terrafix_lab.sim.vehicle.wind import Wind
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.items import Box
-from terrafix_tools.montecarlo.flown import imu_of
-from terrafix_tools.sim.interfaces import Readings
-from terrafix_tools.sim.sensors.suite import VehicleSensors
-from terrafix_tools.sim.true_messages import first_odometry, map_match, seen_from
-from terrafix_tools.sim.vehicle.plane import Plane
-from terrafix_tools.sim.vehicle.wind import Wind
 
 STEP_S, FRAME_EVERY, STATE_EVERY, BATCH = 0.02, 50, 2, 3
 FIX_EVERY = 4

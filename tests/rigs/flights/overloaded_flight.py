@@ -11,7 +11,7 @@ from simulated_flight import CAMERA, PLACE, EstimatorRun
 from terrafix.core.limits import MAX_KEYFRAME_AGE, MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.messages import MapMatch, MeasurementVerdict, Message, NavEstimate, Odometry, Verdict
 from terrafix.vision.feature_tracker import KEYFRAME_SHIFT
-from terrafix_tools.sim.true_messages import first_odometry
+from terrafix_lab.sim.true_messages import first_odometry
 
 FRAME_EVERY = 10  # steps: 5 frames a second
 FRAME_S = 0.2

@@ -11,9 +11,9 @@ from map_matches import pose_of, with_pose
 from simulated_flight import PLACE, Flight, blind, t_ns
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.messages import Frame, MapMatch, Message, Odometry, Relocalization, Verdict
+from terrafix_lab.sim.true_messages import seen_from
 from terrafix_tools.finalise.batch_smoother import Smoothed
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
-from terrafix_tools.sim.true_messages import seen_from
 
 Alter = Callable[[Message], Message | None]  # -> the message to use; None: it is left out
 

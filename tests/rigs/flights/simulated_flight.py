@@ -26,7 +26,7 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
-from terrafix_tools.sim.true_messages import Pose, features, first_odometry, map_match, seen_from
+from terrafix_lab.sim.true_messages import Pose, features, first_odometry, map_match, seen_from
 
 FRAME_S = 0.5
 SPEED_MPS = 12.0

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
+from terrafix_lab.sim.interfaces import Navigation, State, Vehicle, navigation_of
 from terrafix_tools.mission.items import AltitudeFrame, Do, Item, Mission
-from terrafix_tools.sim.interfaces import Navigation, State, Vehicle, navigation_of
 
 PLACE = LocalFrame(48.0, 11.0)
 STEP_S = 0.02

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from terrafix_tools.sim.interfaces import State
+from terrafix_lab.sim.interfaces import State
 
 STEP_S = 0.02
 

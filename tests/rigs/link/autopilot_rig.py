@@ -10,9 +10,9 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.geodesy import LocalFrame, rot_w_b
-from terrafix_tools.sim.autopilot.lockstep import SimAutopilot
-from terrafix_tools.sim.autopilot.parameters import GPS_INPUT_ALONE, NO_DCM, Kind
-from terrafix_tools.sim.interfaces import GnssFix, Navigation, Readings
+from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
+from terrafix_lab.sim.autopilot.parameters import GPS_INPUT_ALONE, NO_DCM, Kind
+from terrafix_lab.sim.interfaces import GnssFix, Navigation, Readings
 
 LAT, LON, HOME_M, HEIGHT_M = 48.0, 11.0, 500.0, 620.0
 STEP_S = 0.02

@@ -8,7 +8,7 @@ import msgspec
 from link_rig import ALT, LAT, LON, MS, SPEED_EAST, covariance, estimate
 from terrafix import messages as m
 from terrafix.link.integrity.output_predictor import offset
-from terrafix_tools.sim.autopilot.course import PeerState
+from terrafix_lab.sim.autopilot.course import PeerState
 
 
 def eastward(t_s: float, north_m: float = 0.0) -> PeerState:

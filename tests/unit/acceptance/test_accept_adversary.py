@@ -8,15 +8,15 @@ import rasterio
 from rasterio.transform import Affine
 
 from terrafix.core.errors import UsageError
-from terrafix_tools.accept import adversary
-from terrafix_tools.accept.cases_table import Case, Line, lines_of, markdown
-from terrafix_tools.accept.fly import Result
-from terrafix_tools.accept.measuring.criteria import PERMANENT, TEMPORARY, unmeasured
-from terrafix_tools.accept.measuring.results import JudgedRow, Verdict
-from terrafix_tools.accept.run import AcceptOptions
-from terrafix_tools.accept.table import conclude
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.flights import make as making
+from terrafix_lab.accept import adversary
+from terrafix_lab.accept.cases_table import Case, Line, lines_of, markdown
+from terrafix_lab.accept.fly import Result
+from terrafix_lab.accept.measuring.criteria import PERMANENT, TEMPORARY, unmeasured
+from terrafix_lab.accept.measuring.results import JudgedRow, Verdict
+from terrafix_lab.accept.run import AcceptOptions
+from terrafix_lab.accept.table import conclude
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.flights import make as making
 
 
 def image(path: Path, *, bands: int = 3, pixel_m: float = 0.5) -> None:

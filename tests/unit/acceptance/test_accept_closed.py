@@ -13,19 +13,19 @@ from terrafix.core.node import Image
 from terrafix.messages import GpsInput
 from terrafix.recorder.provenance import header
 from terrafix.recorder.writer import FlightWriter
-from terrafix_tools.accept import closed
-from terrafix_tools.accept.closed import EditedCamera, sent_fixes
-from terrafix_tools.accept.false_inputs import loop_integrity as of
-from terrafix_tools.accept.false_inputs import scenarios
-from terrafix_tools.accept.false_inputs.scenarios import LIES_IN_THE_LOOP
-from terrafix_tools.accept.measuring.criteria import judge
-from terrafix_tools.accept.measuring.evidence import Evidence, SentFix
-from terrafix_tools.accept.measuring.results import Marks, Span, Verdict
-from terrafix_tools.accept.plan import CLOSED_LOOP
-from terrafix_tools.accept.run import QUICK_LEAVES_OUT
-from terrafix_tools.accept.scenarios import BY_NAME
-from terrafix_tools.sim.closed_loop.loop import TRACK_COLUMNS
-from terrafix_tools.sim.interfaces import State
+from terrafix_lab.accept import closed
+from terrafix_lab.accept.closed import EditedCamera, sent_fixes
+from terrafix_lab.accept.false_inputs import loop_integrity as of
+from terrafix_lab.accept.false_inputs import scenarios
+from terrafix_lab.accept.false_inputs.scenarios import LIES_IN_THE_LOOP
+from terrafix_lab.accept.measuring.criteria import judge
+from terrafix_lab.accept.measuring.evidence import Evidence, SentFix
+from terrafix_lab.accept.measuring.results import Marks, Span, Verdict
+from terrafix_lab.accept.plan import CLOSED_LOOP
+from terrafix_lab.accept.run import QUICK_LEAVES_OUT
+from terrafix_lab.accept.scenarios import BY_NAME
+from terrafix_lab.sim.closed_loop.loop import TRACK_COLUMNS
+from terrafix_lab.sim.interfaces import State
 
 LIE = Span(10.0, 20.0, "lie")
 HZ = 10

@@ -17,14 +17,14 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import start_is_unknown
 from terrafix.messages import Camera, Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept.false_inputs import inputs as lying
-from terrafix_tools.accept.false_inputs import maps as lying_maps
-from terrafix_tools.accept.false_inputs.scenarios import LIES
-from terrafix_tools.accept.faults import flight_edits
-from terrafix_tools.accept.flight import Flight, FrameRef
-from terrafix_tools.accept.measuring.results import Span
-from terrafix_tools.accept.plan import CLOSED_LOOP, Plan
-from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
+from terrafix_lab.accept.false_inputs import inputs as lying
+from terrafix_lab.accept.false_inputs import maps as lying_maps
+from terrafix_lab.accept.false_inputs.scenarios import LIES
+from terrafix_lab.accept.faults import flight_edits
+from terrafix_lab.accept.flight import Flight, FrameRef
+from terrafix_lab.accept.measuring.results import Span
+from terrafix_lab.accept.plan import CLOSED_LOOP, Plan
+from terrafix_lab.accept.scenarios import BY_NAME, SCENARIOS
 from terrafix_tools.evaluate import Truth
 
 CAMERA = Camera(width=8, height=4, fx=8.0, fy=8.0, cx=3.5, cy=1.5)

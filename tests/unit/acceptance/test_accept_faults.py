@@ -14,14 +14,14 @@ from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, Frame, Health, MapMatch, Message, Origin, Prediction, VehicleState, Verdict
 from terrafix.vision.sources import Shot
-from terrafix_tools.accept.false_inputs import inputs as lying
-from terrafix_tools.accept.false_inputs.maps import stale_along
-from terrafix_tools.accept.faults import flight_edits
-from terrafix_tools.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
-from terrafix_tools.accept.flight import Flight, FrameRef, read_any_truth
-from terrafix_tools.accept.measuring.results import Span
-from terrafix_tools.accept.plan import Plan
-from terrafix_tools.accept.scenarios import BY_NAME
+from terrafix_lab.accept.false_inputs import inputs as lying
+from terrafix_lab.accept.false_inputs.maps import stale_along
+from terrafix_lab.accept.faults import flight_edits
+from terrafix_lab.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_lab.accept.flight import Flight, FrameRef, read_any_truth
+from terrafix_lab.accept.measuring.results import Span
+from terrafix_lab.accept.plan import Plan
+from terrafix_lab.accept.scenarios import BY_NAME
 from terrafix_tools.evaluate import Truth
 
 CAMERA = Camera(width=8, height=4, fx=8.0, fy=8.0, cx=3.5, cy=1.5)

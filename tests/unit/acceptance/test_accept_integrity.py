@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from accept_case import STEP_S, FrameCase, evidence
-from terrafix_tools.accept.false_inputs import integrity as of
-from terrafix_tools.accept.fly import Result
-from terrafix_tools.accept.measuring.criteria import judge
-from terrafix_tools.accept.measuring.results import Marks, Span, Verdict
-from terrafix_tools.accept.table import conclude
+from terrafix_lab.accept.false_inputs import integrity as of
+from terrafix_lab.accept.fly import Result
+from terrafix_lab.accept.measuring.criteria import judge
+from terrafix_lab.accept.measuring.results import Marks, Span, Verdict
+from terrafix_lab.accept.table import conclude
 
 GOOD = FrameCase()
 FALSE = FrameCase(error_m=80.0)

@@ -13,9 +13,9 @@ from terrafix.link.ground_station import prior_request
 from terrafix.link.ground_station.prior_request import PriorRequest
 from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
-from terrafix_tools.accept.measuring import measures as of
-from terrafix_tools.accept.measuring.criteria import CRITERIA, judge
-from terrafix_tools.accept.measuring.results import Bounds, JudgedRow, Marks, Span, Verdict, with_unit
+from terrafix_lab.accept.measuring import measures as of
+from terrafix_lab.accept.measuring.criteria import CRITERIA, judge
+from terrafix_lab.accept.measuring.results import Bounds, JudgedRow, Marks, Span, Verdict, with_unit
 
 GOOD = FrameCase()
 LOST = FrameCase(

@@ -13,14 +13,14 @@ from rich.console import Console
 
 from accept_case import FrameCase, evidence
 from terrafix.core.errors import MapError, OutputError, UsageError
-from terrafix_tools.accept import fly, run
-from terrafix_tools.accept.false_inputs.scenarios import LIES
-from terrafix_tools.accept.fly import Job, Point, Result
-from terrafix_tools.accept.measuring.criteria import EVERYWHERE, unmeasured
-from terrafix_tools.accept.measuring.results import JudgedRow, Marks, Span, Verdict
-from terrafix_tools.accept.run import AcceptOptions, accept, truth_of
-from terrafix_tools.accept.scenarios import BY_NAME, SCENARIOS
-from terrafix_tools.accept.table import conclude, headline, markdown, write
+from terrafix_lab.accept import fly, run
+from terrafix_lab.accept.false_inputs.scenarios import LIES
+from terrafix_lab.accept.fly import Job, Point, Result
+from terrafix_lab.accept.measuring.criteria import EVERYWHERE, unmeasured
+from terrafix_lab.accept.measuring.results import JudgedRow, Marks, Span, Verdict
+from terrafix_lab.accept.run import AcceptOptions, accept, truth_of
+from terrafix_lab.accept.scenarios import BY_NAME, SCENARIOS
+from terrafix_lab.accept.table import conclude, headline, markdown, write
 
 
 def row(verdict: Verdict, **more: object) -> JudgedRow:

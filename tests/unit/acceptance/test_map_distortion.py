@@ -8,8 +8,8 @@ import pytest
 
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import MapMatch, MapPose, Verdict
-from terrafix_tools.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals, shows_distortion
-from terrafix_tools.accept.measuring.measures import map_px
+from terrafix_lab.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals, shows_distortion
+from terrafix_lab.accept.measuring.measures import map_px
 
 DOWN, HEIGHT_M, FOCAL_PX = np.diag([1.0, -1.0, -1.0]), 100.0, 700.0
 

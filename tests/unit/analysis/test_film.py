@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from terrafix_tools.sim.camera.film import Developer, Film
-from terrafix_tools.sim.camera.schedule import Schedule
+from terrafix_lab.sim.camera.film import Developer, Film
+from terrafix_lab.sim.camera.schedule import Schedule
 
 WIDTH, HEIGHT = 320, 240
 IDEAL = Film(noise=0.0, vignette=0.0, blur_px=0.0, exposure_jitter=0.0, detail=0.0)

@@ -69,13 +69,28 @@ def test_a_propagated_position_is_trusted_as_long_as_the_link_sends_it(age_ms: i
     assert (flight_verdict(flown).share == 1.0) is trusted
 
 
-def test_a_start_without_confirming_map_match_is_trusted_only_briefly() -> None:
+def test_a_start_that_a_map_match_confirms_late_is_trusted_only_briefly() -> None:
     flown = rows()
-    for row in flown:
+    for row in flown[:-1]:
         row.anchor_age_ms = -1
     verdict = flight_verdict(flown)
-    assert verdict.spans == [(0.0, 5.0)]
+    assert verdict.spans == [(0.0, 5.0), (59.0, 59.0)]
     assert verdict.reasons == ["no map match has confirmed the start"]
+
+
+def test_a_flight_that_no_map_match_ever_confirmed_is_not_trusted() -> None:
+    flown = rows(2)
+    for row in flown:
+        row.anchor_age_ms = -1
+    assert flight_verdict(flown).text() == "Do not trust it (no map match has confirmed the start)."
+
+
+def test_frames_that_are_not_placed_are_named_as_such() -> None:
+    flown = rows()
+    for row in flown[:3]:
+        row.lat_deg, row.lon_deg, row.source_label, row.anchor_age_ms = None, None, m.SourceLabel.NOT_PLACED, -1
+    verdict = flight_verdict(flown)
+    assert verdict.spans == [(3.0, 59.0)] and verdict.reasons == ["not found on the map"]
 
 
 def test_a_calibration_fault_applies_from_the_start_of_the_flight() -> None:

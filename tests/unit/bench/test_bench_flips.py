@@ -6,7 +6,7 @@ import pytest
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import MapMatch, MatchPlace, MeasurementVerdict, Odometry, Verdict
-from terrafix_tools.bench.flips import Decisions, _take, differences, read_decisions
+from terrafix_lab.bench.flips import Decisions, _take, differences, read_decisions
 
 PAIRS = [(0.1, 0.2, 0.11, 0.2), (-0.3, 0.1, -0.29, 0.1), (0.0, -0.2, 0.01, -0.2)]
 MATCHES = [(0.1, 0.2, 10.0, 20.0, 0.0, 0.5), (-0.3, 0.1, -30.0, 10.0, 0.0, 0.5)]

@@ -14,8 +14,8 @@ from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameInput
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Imu
-from terrafix_tools.bench.growth import estimator_cost, map_size
-from terrafix_tools.bench.growth.stream import FIX_EVERY, FRAME_S, LEG_S, ORIGIN, frame_messages
+from terrafix_lab.bench.growth import estimator_cost, map_size
+from terrafix_lab.bench.growth.stream import FIX_EVERY, FRAME_S, LEG_S, ORIGIN, frame_messages
 
 
 def test_the_estimator_follows_the_synthetic_flight() -> None:

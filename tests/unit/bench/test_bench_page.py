@@ -11,9 +11,9 @@ import pytest
 
 from terrafix.core.errors import OutputError
 from terrafix.messages import Frame
-from terrafix_tools.bench.comparison import compared
-from terrafix_tools.bench.kernels import KernelTimes, floors, timed_kernels
-from terrafix_tools.bench.page import comparison_table, page, stage_table, write_page
+from terrafix_lab.bench.comparison import compared
+from terrafix_lab.bench.kernels import KernelTimes, floors, timed_kernels
+from terrafix_lab.bench.page import comparison_table, page, stage_table, write_page
 
 
 def spread(median: float) -> dict[str, float]:

@@ -11,7 +11,7 @@ import map_rasters
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.sources import open_source
-from terrafix_tools.bench.photos import ADVANCE, FOCAL, SEEN_PX, write_photos
+from terrafix_lab.bench.photos import ADVANCE, FOCAL, SEEN_PX, write_photos
 
 SIZE_PX = 1200, 800
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from terrafix.core.errors import UsageError
-from terrafix_tools.bench.processors import DEFAULT_ROWS, ROWS, _known, compare, complete, fly, impossible, tables
+from terrafix_lab.bench.processors import DEFAULT_ROWS, ROWS, _known, compare, complete, fly, impossible, tables
 from terrafix_tools.estimates import COLUMNS
 
 M_PER_DEGREE = 111_195.0  # of latitude, sphere; the ellipsoid differs by less than 1 %

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from terrafix_tools.bench.restart import Kill, missed, summary
+from terrafix_lab.bench.restart import Kill, missed, summary
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import Prediction
 from terrafix_engines.features.keypoints import Keypoints, MutualNearestMatcher
-from terrafix_tools.bench.peers import AKAZE, LIGHTERGLUE, SIFT, XFEAT, ModelPoints, Peer, methods
-from terrafix_tools.bench.run import bench
+from terrafix_lab.bench.peers import AKAZE, LIGHTERGLUE, SIFT, XFEAT, ModelPoints, Peer, methods
+from terrafix_lab.bench.run import bench
 from textured_ground import PINHOLE, FlatMap, rotation, texture, view
 
 FRAMES = 3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix_tools.bench.soak import Samples, grows, growth, slope_per_h
+from terrafix_lab.bench.soak import Samples, grows, growth, slope_per_h
 
 
 def samples(mb_per_h: float, *, files: int = 0, away: bool = False) -> Samples:

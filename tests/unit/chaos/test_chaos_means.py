@@ -15,18 +15,18 @@ import pytest
 
 from terrafix.core.errors import OutputError, SourceError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.chaos import rig
-from terrafix_tools.chaos.camera import camera_toml
-from terrafix_tools.chaos.faults import FAULTS
-from terrafix_tools.chaos.memory_group import V1, V2, MemoryGroup
-from terrafix_tools.chaos.recorded_scene import recorded_scene
-from terrafix_tools.chaos.rig import Need
-from terrafix_tools.chaos.run import fly_cell, missing_here
-from terrafix_tools.chaos.scene import Phase, Scene
-from terrafix_tools.chaos.serial_line import SerialLine
-from terrafix_tools.chaos.switches import Switch, Switches
-from terrafix_tools.chaos.verdict import sigmas
-from terrafix_tools.sim.autopilot.report import ReceivedFix
+from terrafix_lab.chaos import rig
+from terrafix_lab.chaos.camera import camera_toml
+from terrafix_lab.chaos.faults import FAULTS
+from terrafix_lab.chaos.memory_group import V1, V2, MemoryGroup
+from terrafix_lab.chaos.recorded_scene import recorded_scene
+from terrafix_lab.chaos.rig import Need
+from terrafix_lab.chaos.run import fly_cell, missing_here
+from terrafix_lab.chaos.scene import Phase, Scene
+from terrafix_lab.chaos.serial_line import SerialLine
+from terrafix_lab.chaos.switches import Switch, Switches
+from terrafix_lab.chaos.verdict import sigmas
+from terrafix_lab.sim.autopilot.report import ReceivedFix
 
 
 def fault(name: str):  # type: ignore[no-untyped-def]

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from terrafix.core.errors import OutputError, SourceError
-from terrafix_tools.chaos import verdict
-from terrafix_tools.chaos.camera import Look, StreamedCamera, altered
-from terrafix_tools.chaos.faults import FAULTS
-from terrafix_tools.chaos.run import Results
-from terrafix_tools.chaos.scene import AGL_M, Phase, phases
-from terrafix_tools.chaos.table import table, write_table
-from terrafix_tools.chaos.verdict import Outcome
+from terrafix_lab.chaos import verdict
+from terrafix_lab.chaos.camera import Look, StreamedCamera, altered
+from terrafix_lab.chaos.faults import FAULTS
+from terrafix_lab.chaos.run import Results
+from terrafix_lab.chaos.scene import AGL_M, Phase, phases
+from terrafix_lab.chaos.table import table, write_table
+from terrafix_lab.chaos.verdict import Outcome
+from terrafix_lab.sim.autopilot.course import PeerState
+from terrafix_lab.sim.autopilot.report import ReceivedFix
+from terrafix_lab.sim.camera.stream import FrameStream
 from terrafix_tools.score import longest_gap_s
-from terrafix_tools.sim.autopilot.course import PeerState
-from terrafix_tools.sim.autopilot.report import ReceivedFix
-from terrafix_tools.sim.camera.stream import FrameStream
 
 
 def ticks(from_s: float, to_s: float) -> list[float]:

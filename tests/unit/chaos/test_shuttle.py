@@ -9,12 +9,12 @@ import pytest
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.repeated_picture import HISTORY
-from terrafix_tools.chaos.scene import LEG_M, Scene, course_of
-from terrafix_tools.chaos.shuttle import WAY, A, endless, lap_of, lap_steps
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.flights.folder import FRAME_HZ, Flight
-from terrafix_tools.sim.flights.path import STEP_S, FlownPath
-from terrafix_tools.sim.interfaces import State
+from terrafix_lab.chaos.scene import LEG_M, Scene, course_of
+from terrafix_lab.chaos.shuttle import WAY, A, endless, lap_of, lap_steps
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.flights.folder import FRAME_HZ, Flight
+from terrafix_lab.sim.flights.path import STEP_S, FlownPath
+from terrafix_lab.sim.interfaces import State
 
 FRAME = LocalFrame(48.0, 11.0)
 SPEED_MPS = 9.7  # a lap is no whole number of periods of the camera

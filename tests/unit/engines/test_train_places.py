@@ -10,8 +10,8 @@ import pytest
 from rasterio.transform import Affine
 
 import map_rasters
-from terrafix_engines.train.errors import TrainingError
-from terrafix_engines.train.ground import Place, read_list, read_places
+from terrafix_lab.train.errors import TrainingError
+from terrafix_lab.train.ground import Place, read_list, read_places
 
 GSD_M = 0.5
 
@@ -93,7 +93,7 @@ def test_an_invalid_place_list_is_rejected(tmp_path: Path, text: str, reason: st
 def test_without_pytorch_the_error_names_the_package_to_install() -> None:
     code = (
         "import runpy, sys; sys.modules['torch'] = None; sys.argv = ['train', 'x.toml', '--out', 'y'];"
-        "runpy.run_module('terrafix_engines.train', run_name='__main__')"
+        "runpy.run_module('terrafix_lab.train', run_name='__main__')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1

@@ -11,12 +11,12 @@ torch = pytest.importorskip("torch", reason="PyTorch is not there (extra `train`
 
 from terrafix_engines.features import open_describer  # noqa: E402
 from terrafix_engines.manifest import read  # noqa: E402
-from terrafix_engines.train.errors import TrainingError  # noqa: E402
-from terrafix_engines.train.export import ManifestText, export  # noqa: E402
-from terrafix_engines.train.loop import Recipe, Training, augment_views, learning_rate_factor  # noqa: E402
-from terrafix_engines.train.losses import PLACES, WEIGHTS, corners, places  # noqa: E402
-from terrafix_engines.train.network import FeatureNetwork, normalise_contrast  # noqa: E402
-from terrafix_engines.train.views import (  # noqa: E402
+from terrafix_lab.train.errors import TrainingError  # noqa: E402
+from terrafix_lab.train.export import ManifestText, export  # noqa: E402
+from terrafix_lab.train.loop import Recipe, Training, augment_views, learning_rate_factor  # noqa: E402
+from terrafix_lab.train.losses import PLACES, WEIGHTS, corners, places  # noqa: E402
+from terrafix_lab.train.network import FeatureNetwork, normalise_contrast  # noqa: E402
+from terrafix_lab.train.views import (  # noqa: E402
     EVALUATION_RANGES,
     REACH_CELLS,
     TRAINING_RANGES,

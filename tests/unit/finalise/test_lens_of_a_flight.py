@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafix_tools.bench import finalised
+from terrafix_lab.bench import finalised
 from terrafix_tools.finalise.before_after import Change
 from terrafix_tools.finalise.output import read_flights
 from terrafix_tools.report.data import FlightView

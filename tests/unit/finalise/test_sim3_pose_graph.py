@@ -8,7 +8,7 @@ import pytest
 from terrafix.core.pose import exp_so3
 from terrafix.smoother.sim3_pose_graph import merge
 from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, RelativeConstraint, Submap
-from terrafix_tools.bench.growth.merging import STEP_SIGMAS, SubmapFlight, make_submap_flight, measure, pose_errors
+from terrafix_lab.bench.growth.merging import STEP_SIGMAS, SubmapFlight, make_submap_flight, measure, pose_errors
 from terrafix_tools.score import nees_of
 
 CHI2_95_2 = 5.991

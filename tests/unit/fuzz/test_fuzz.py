@@ -12,9 +12,9 @@ from typer import Exit
 from terrafix.core.errors import MapError, SourceError
 from terrafix.map.package import MapPackage
 from terrafix.vision.sources.images import decode_image
-from terrafix_tools.fuzz import __main__ as command
-from terrafix_tools.fuzz.mutate import MAX_BYTES, mutated
-from terrafix_tools.fuzz.targets import HEIGHT, TARGETS, WIDTH, Target, refused_or_read
+from terrafix_lab.fuzz import __main__ as command
+from terrafix_lab.fuzz.mutate import MAX_BYTES, mutated
+from terrafix_lab.fuzz.targets import HEIGHT, TARGETS, WIDTH, Target, refused_or_read
 
 CORPUS = Path(__file__).resolve().parents[2] / "corpus"
 TARGET_OF = {target.name.replace(" ", "-"): target for target in TARGETS}

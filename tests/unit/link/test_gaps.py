@@ -8,7 +8,7 @@ from autopilot_rig import Rig
 from companion_rig import Companion
 from terrafix.core.config import LinkSection
 from terrafix.messages import GpsInput
-from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
+from terrafix_lab.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
 
 BEGIN_S = 20.0
 EKF_POS_HORIZ_ABS = 16

@@ -141,6 +141,31 @@ def test_the_fix_type_has_hysteresis_at_the_accuracy_limit() -> None:
     assert sum(a.fix_type != b.fix_type for a, b in pairwise(gps(published))) <= 1
 
 
+def test_a_withdrawn_fix_stays_away_for_a_second_and_returns_by_narrower_limits() -> None:
+    """Estimates of a computer that is too slow: the speed accuracy crosses the limit ten times a second."""
+    make = lambda t: estimate(t, velocity_sigma=1.6 if t % (200 * MS) else 1.4)  # noqa: E731
+    slow = fly(LinkNode(10.0), 0, 20 * S, every(100 * MS, lambda t: estimate(t) if t < 2 * S else make(t)))
+    assert sum(a.fix_type != b.fix_type for a, b in pairwise(gps(slow))) <= 2
+    once = fly(
+        LinkNode(10.0), 0, 9 * S, every(100 * MS, lambda t: estimate(t, velocity_sigma=9.0 if t == 5 * S else 0.5))
+    )
+    away = [g.t_ns for g in gps_since(once, 4 * S) if g.fix_type == 1]
+    assert 900 * MS <= away[-1] - away[0] <= 1100 * MS
+    assert {g.fix_type for g in gps_since(once, 7 * S)} == {3}
+
+
+def test_a_position_that_no_place_stands_behind_is_no_fix() -> None:
+    sent = gps(
+        fly(LinkNode(10.0), 0, 3 * S, every(200 * MS, lambda t: estimate(t, source_label=m.SourceLabel.NOT_PLACED)))
+    )
+    assert {g.fix_type for g in sent} == {1} and sent[-1].no_fix_reason == "not found on the map yet"
+
+
+def test_an_unknown_elevation_is_sent_with_the_largest_vertical_accuracy() -> None:
+    sent = gps(fly(LinkNode(10.0), 0, 3 * S, every(200 * MS, lambda t: estimate(t, amsl_known=False))))
+    assert sent[-1].fix_type == 3 and sent[-1].vert_accuracy_m == 100.0
+
+
 def test_an_accuracy_spike_lowers_the_fix_instead_of_opening_the_gate() -> None:
     def make(t: int) -> m.NavEstimate:
         return estimate(t, sigma_m=30.0 if 5 * S <= t < 6 * S or t >= 10 * S else 3.0)
@@ -193,7 +218,7 @@ def test_after_a_gap_below_5_s_no_better_accuracy_is_awaited() -> None:
     node = LinkNode(10.0)
     fly(node, 0, 10 * S, every(100 * MS, lambda t: estimate(t, sigma_m=3.0)))
     fly(node, 10 * S, 14 * S, lambda _: [])
-    sent = gps(fly(node, 14 * S, 16 * S, every(100 * MS, lambda t: estimate(t, sigma_m=8.0, velocity_sigma=1.35))))
+    sent = gps(fly(node, 14 * S, 16 * S, every(100 * MS, lambda t: estimate(t, sigma_m=8.0, velocity_sigma=1.2))))
     assert {g.fix_type for g in sent if g.t_ns > 14_300 * MS} == {3}
 
 

@@ -25,7 +25,7 @@ from terrafix.link.output import global_position, gps_time, msp, nmea, odometry
 from terrafix.link.output.odometry import Attitude, GeodeticPoint
 from terrafix.link.output.selection import PositionOutputs
 from terrafix.link.output.serial_outputs import open_serial_outputs
-from terrafix_tools.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.autopilot.parameters import Kind
 from vision_origin import PINHOLE_ORIGIN
 
 S, MS = 1_000_000_000, 1_000_000

@@ -27,10 +27,10 @@ from terrafix.link.edge import open_edge
 from terrafix.link.mavlink.message_rates import STREAMS_HZ
 from terrafix.link.node import LinkNode
 from terrafix.link.output import gps_input
-from terrafix_tools.sim.autopilot.course import PeerState, read_course, write_course
-from terrafix_tools.sim.autopilot.navigation.gps import GpsInputDriver, JitterCorrection
-from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, GPS_INPUT_ALONE, NO_DCM
-from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+from terrafix_lab.sim.autopilot.course import PeerState, read_course, write_course
+from terrafix_lab.sim.autopilot.navigation.gps import GpsInputDriver, JitterCorrection
+from terrafix_lab.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, GPS_INPUT_ALONE, NO_DCM
+from terrafix_lab.sim.autopilot.peer import AutopilotPeer
 
 pytestmark = pytest.mark.real_time
 
@@ -301,7 +301,7 @@ def test_the_simulated_autopilot_runs_in_its_own_process(tmp_path: Path) -> None
     out = tmp_path / "peer.json"
     zero_ns = time.monotonic_ns()
     options = ["--port", "0", "--out", str(out), "--start-ns", str(zero_ns)]
-    command = [sys.executable, "-m", "terrafix_tools.sim.autopilot.process", str(tmp_path / "course.csv"), *options]
+    command = [sys.executable, "-m", "terrafix_lab.sim.autopilot.process", str(tmp_path / "course.csv"), *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         port = int(process.stdout.readline().rsplit(":", 1)[1])

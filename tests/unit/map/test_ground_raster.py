@@ -15,8 +15,8 @@ import map_rasters
 from terrafix import messages as m
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.camera.render import Film, Renderer
-from terrafix_tools.sim.ground.draped_image import open_ground
+from terrafix_lab.sim.camera.render import Film, Renderer
+from terrafix_lab.sim.ground.draped_image import open_ground
 
 CAMERA = m.Camera(width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5)
 PLAIN = Film(noise=0.0, vignette=0.0, blur_px=0.0, exposure_jitter=0.0, detail=0.0)

@@ -8,9 +8,9 @@ import pytest
 from link_rig import S, estimate
 from terrafix.core.errors import UsageError
 from terrafix.messages import Frame, Message
-from terrafix_tools.golden import __main__ as golden
-from terrafix_tools.golden.cases import CASES, Case
-from terrafix_tools.golden.digest import Digest, Digests, differences
+from terrafix_lab.golden import __main__ as golden
+from terrafix_lab.golden.cases import CASES, Case
+from terrafix_lab.golden.digest import Digest, Digests, differences
 
 FRAMES: list[Message] = [Frame(t_ns=i * S, frame_id=i, file=f"{i}.jpg", width=8, height=4) for i in range(3)]
 

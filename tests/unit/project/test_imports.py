@@ -8,11 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from terrafix_tools import cli
+
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGES = {
     "terrafix": ROOT / "daemon" / "terrafix",
     "terrafix_engines": ROOT / "engines" / "terrafix_engines",
     "terrafix_tools": ROOT / "tools" / "terrafix_tools",
+    "terrafix_lab": ROOT / "tools" / "terrafix_lab",
 }
 # library -> the modules (and their submodules) that may import it
 OWNERS = {
@@ -20,29 +23,30 @@ OWNERS = {
         "terrafix.estimator",
         "terrafix.smoother",
         "terrafix_tools.finalise",
-        "terrafix_tools.bench.growth.estimator_cost",
-        "terrafix_tools.bench.growth.merging_baseline",
+        "terrafix_lab.bench.growth.estimator_cost",
+        "terrafix_lab.bench.growth.merging_baseline",
     ),
     "pymavlink": (
         "terrafix.link",
-        "terrafix_tools.sim.autopilot",
+        "terrafix_lab.sim.autopilot",
         "terrafix.core.mavlink.tlog",
-        "terrafix_tools.sim.flights.log",
-        "terrafix_tools.sim.sitl",
+        "terrafix_lab.sim.flights.log",
+        "terrafix_lab.sim.sitl",
         "terrafix_tools.preflight",
-        "terrafix_tools.golden",
+        "terrafix_lab.golden",
         "terrafix_tools.autopilot_log",
     ),  # tlog: reads recorded telemetry
-    "mavsdk": ("terrafix_tools.sim.sitl",),
+    "mavsdk": ("terrafix_lab.sim.sitl",),
     "serial": ("terrafix.link",),
     "onnxruntime": ("terrafix_engines",),
-    "torch": ("terrafix_engines.train",),
+    "torch": ("terrafix_lab.train",),
     "faiss": ("terrafix.anchor.place_index.faiss_ivf",),
     "systemd": ("terrafix.runtime.systemd",),
     "zmq": ("terrafix.runtime",),
     "pickle": (),
 }
 DIRECTION = {  # package -> other packages of the project that it may import
+    "terrafix_lab": {"terrafix_tools", "terrafix", "terrafix_engines"},
     "terrafix_tools": {"terrafix", "terrafix_engines"},
     "terrafix": {"terrafix_engines"},
     "terrafix_engines": set(),
@@ -80,6 +84,17 @@ def test_packages_are_imported_in_one_direction_only(module: str) -> None:
     package = module.split(".")[0]
     ours = {name.split(".")[0] for name in imports(MODULES[module])} & set(PACKAGES)
     assert ours <= DIRECTION[package] | {package}
+
+
+def test_below_the_lab_only_the_table_of_commands_names_it() -> None:
+    """A name in a string (a process to start, a module to load) is a dependency as much as an import."""
+    named = {
+        module: path.read_text(encoding="utf-8").count("terrafix_lab")
+        for module, path in MODULES.items()
+        if module.split(".")[0] != "terrafix_lab"
+    }
+    in_table = sum(path.startswith("terrafix_lab.") for path in cli.MODULES.values())
+    assert {module: count for module, count in named.items() if count} == {"terrafix_tools.cli": in_table}
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -35,22 +35,21 @@ IMPORTED_AS = {
     "systemd-python": "systemd",
 }
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # used by scripts/check or the build
-TRAINING = ROOT / "engines" / "terrafix_engines" / "train"  # part of the engines package, used on the ground only
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 SEARCH = ROOT / "daemon" / "terrafix" / "anchor" / "place_index" / "faiss_ivf.py"  # the only file that imports FAISS
 SERVICE = ROOT / "daemon" / "terrafix" / "runtime" / "systemd.py"  # the only file that imports systemd-python
-OURS = {"terrafix", "terrafix_engines", "terrafix_tools"}
+OURS = {"terrafix", "terrafix_engines", "terrafix_tools", "terrafix_lab"}
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 
 def imported(*folders: str, extras: bool = True) -> set[str]:
     """Top-level names of all third-party modules imported below the folders; with or without the code of the extras of
-    what flies: training, FAISS and systemd."""
+    what flies: FAISS and systemd."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
         for path in (ROOT / folder).rglob("*.py"):
-            if not extras and (TRAINING in path.parents or path in (SEARCH, SERVICE)):
+            if not extras and path in (SEARCH, SERVICE):
                 continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Import):

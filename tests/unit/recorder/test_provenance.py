@@ -16,9 +16,9 @@ from terrafix.recorder import provenance
 from terrafix.recorder.provenance import copied_header, header, map_of, models_of
 from terrafix.recorder.reader import ReadResult, read_flight
 from terrafix.recorder.writer import CALIBRATION_NAME, FlightWriter
+from terrafix_lab.sim.world.place import generate
 from terrafix_tools.log.edit import cut
 from terrafix_tools.mapping.build import build
-from terrafix_tools.sim.world.place import generate
 
 
 def header_of(path: Path) -> dict[str, object]:

@@ -14,8 +14,8 @@ from terrafix.core.errors import EvaluationError, OutputError, SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.mavlink.tlog import read_tlog
 from terrafix.vision.sources import open_source
-from terrafix_tools.sim.flights.recorded import read_recorded, write_recorded
-from terrafix_tools.sim.flights.smooth import smooth
+from terrafix_lab.sim.flights.recorded import read_recorded, write_recorded
+from terrafix_lab.sim.flights.smooth import smooth
 
 DataSet = Callable[[str], Path]
 PLACE = LocalFrame(47.0, 8.0)

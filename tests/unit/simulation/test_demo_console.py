@@ -15,8 +15,8 @@ from terrafix.core.errors import LinkError
 from terrafix.processes import PROCESSES
 from terrafix.runtime.run_dir import OwnedRunDir, live_runs
 from terrafix.runtime.run_spec import spec_of
-from terrafix_tools.sim.demo import console
-from terrafix_tools.sim.demo.console import DemoConsole, run_of
+from terrafix_lab.sim.demo import console
+from terrafix_lab.sim.demo.console import DemoConsole, run_of
 
 
 def test_the_console_of_the_demo_reads_the_run_that_writes_into_its_folder(

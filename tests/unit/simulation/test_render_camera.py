@@ -11,12 +11,12 @@ from rasterio.transform import Affine
 from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.camera.lens import Fisheye
-from terrafix_tools.sim.camera.mount import Fixed, Gimbal, Motion
-from terrafix_tools.sim.camera.render import Film, Renderer
-from terrafix_tools.sim.camera.weather import Weather
-from terrafix_tools.sim.ground.draped_image import Ground, drape
-from terrafix_tools.sim.interfaces import State
+from terrafix_lab.sim.camera.lens import Fisheye
+from terrafix_lab.sim.camera.mount import Fixed, Gimbal, Motion
+from terrafix_lab.sim.camera.render import Film, Renderer
+from terrafix_lab.sim.camera.weather import Weather
+from terrafix_lab.sim.ground.draped_image import Ground, drape
+from terrafix_lab.sim.interfaces import State
 
 FRAME = LocalFrame(48.0, 15.0)  # on the central meridian of UTM 33
 PLAIN = Film(noise=0.0, vignette=0.0, blur_px=0.0, exposure_jitter=0.0, detail=0.0)

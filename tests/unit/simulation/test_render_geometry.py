@@ -10,7 +10,7 @@ from rasterio.transform import Affine
 
 from terrafix import messages as m
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.camera.render import Film, Renderer, drape
+from terrafix_lab.sim.camera.render import Film, Renderer, drape
 
 UTM = 32633
 WEST_M, NORTH_M, GSD_M = 452_000.0, 5_333_000.0, 0.5

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from terrafix.core.errors import SourceError
-from terrafix_tools.sim.interfaces import GnssFix
-from terrafix_tools.sim.sensors.gnss import DELAY_S, Gnss
-from terrafix_tools.sim.sensors.gnss_events import AnyEvent, Drag, Jam, Jump, Outage, read_events
+from terrafix_lab.sim.interfaces import GnssFix
+from terrafix_lab.sim.sensors.gnss import DELAY_S, Gnss
+from terrafix_lab.sim.sensors.gnss_events import AnyEvent, Drag, Jam, Jump, Outage, read_events
 from vehicle_missions import PLACE
 from vehicle_state import STEP_S, state
 

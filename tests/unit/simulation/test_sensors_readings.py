@@ -6,10 +6,10 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from terrafix_tools.sim.interfaces import Readings
-from terrafix_tools.sim.sensors.clock import Clock
-from terrafix_tools.sim.sensors.errors import TYPICAL, SensorErrors
-from terrafix_tools.sim.sensors.suite import VehicleSensors
+from terrafix_lab.sim.interfaces import Readings
+from terrafix_lab.sim.sensors.clock import Clock
+from terrafix_lab.sim.sensors.errors import TYPICAL, SensorErrors
+from terrafix_lab.sim.sensors.suite import VehicleSensors
 from vehicle_missions import PLACE
 from vehicle_state import STEP_S, changes, state
 

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from terrafix_lab.sim.vehicle.copter import Copter, CopterLimits
+from terrafix_lab.sim.vehicle.plane import Plane, PlaneLimits
+from terrafix_lab.sim.vehicle.wind import Gusts, Wind
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.items import AltitudeFrame, Box, Do, Item
-from terrafix_tools.sim.vehicle.copter import Copter, CopterLimits
-from terrafix_tools.sim.vehicle.plane import Plane, PlaneLimits
-from terrafix_tools.sim.vehicle.wind import Gusts, Wind
 from vehicle_missions import HOME, PLACE, STEP_S, at, flat, fly, hills, mission, positions
 
 CALM = Wind(0.0, 0.0)

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from terrafix.core.geodesy import rot_w_b
+from terrafix_lab.sim.interfaces import State
+from terrafix_lab.sim.vehicle.copter import Copter
+from terrafix_lab.sim.vehicle.plane import Plane
 from terrafix_tools.mission.items import Do, Item, Mission
-from terrafix_tools.sim.interfaces import State
-from terrafix_tools.sim.vehicle.copter import Copter
-from terrafix_tools.sim.vehicle.plane import Plane
 from vehicle_missions import HOME, PLACE, STEP_S, at, fly, hills, mission, positions
 
 GRAVITY_ENU_MPS2 = np.array([0.0, 0.0, -9.80665])

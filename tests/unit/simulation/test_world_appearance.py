@@ -11,11 +11,11 @@ import rasterio
 
 from terrafix.core.errors import OutputError, UsageError
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.ground.detail import detail
-from terrafix_tools.sim.world import place as world
-from terrafix_tools.sim.world.noise import smooth, white
-from terrafix_tools.sim.world.paint import Painter
-from terrafix_tools.sim.world.season import SEASONS
+from terrafix_lab.sim.ground.detail import detail
+from terrafix_lab.sim.world import place as world
+from terrafix_lab.sim.world.noise import smooth, white
+from terrafix_lab.sim.world.paint import Painter
+from terrafix_lab.sim.world.season import SEASONS
 
 SMALL = {"width_m": 900.0, "height_m": 700.0}
 
@@ -110,8 +110,8 @@ from pathlib import Path
 import cv2, numpy as np
 from terrafix import messages as m
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.sim.world import place as world
-from terrafix_tools.sim.camera.render import Renderer
+from terrafix_lab.sim.world import place as world
+from terrafix_lab.sim.camera.render import Renderer
 cv2.setNumThreads(1)
 place = world.generate(3, width_m=10_000.0, height_m=10_000.0)
 ground = place.ground("autumn", LocalFrame(*place.wgs84(5000.0, 5000.0)))

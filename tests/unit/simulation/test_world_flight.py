@@ -15,11 +15,9 @@ from typer.testing import CliRunner
 from terrafix.core.errors import OutputError, SourceError, TerrafixError, UsageError
 from terrafix.core.mavlink.tlog import read_tlog
 from terrafix.vision.sources import open_source
-from terrafix_tools.cli import app
-from terrafix_tools.mission.items import Box
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.camera.render import Renderer
-from terrafix_tools.sim.flights.folder import (
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.camera.render import Renderer
+from terrafix_lab.sim.flights.folder import (
     CAMERA,
     FRAME_HZ,
     Flight,
@@ -28,9 +26,11 @@ from terrafix_tools.sim.flights.folder import (
     plan_flight,
     write_flight,
 )
-from terrafix_tools.sim.flights.make import FlightOptions, make
-from terrafix_tools.sim.flights.scene import Scene, scene_of_image, scene_of_place, scene_of_world
-from terrafix_tools.sim.world import place as world
+from terrafix_lab.sim.flights.make import FlightOptions, make
+from terrafix_lab.sim.flights.scene import Scene, scene_of_image, scene_of_place, scene_of_world
+from terrafix_lab.sim.world import place as world
+from terrafix_tools.cli import app
+from terrafix_tools.mission.items import Box
 
 DURATION_S = 90.0
 GREY = np.full((4000, 6000, 3), 90, np.uint8)

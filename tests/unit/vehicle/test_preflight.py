@@ -23,6 +23,7 @@ from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.signature import generate
 from terrafix.link.gnss.previous_source import PreviousSource, PreviousSourceFile
 from terrafix.link.mavlink.transport import Address, Chunk
+from terrafix_lab.sim.autopilot.parameters import FIRMWARE
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
@@ -34,7 +35,6 @@ from terrafix_tools.preflight.lines import Line, Status, number
 from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.rules import ALWAYS, GPS_INPUT_RULES, LOCAL_RULES, Context
 from terrafix_tools.preflight.run import _parameter_lines, _vehicle_lines, preflight
-from terrafix_tools.sim.autopilot.parameters import FIRMWARE
 
 ROOT = Path(__file__).resolve().parents[3]
 VEHICLES = ROOT / "config" / "vehicles"

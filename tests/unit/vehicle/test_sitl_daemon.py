@@ -16,9 +16,9 @@ from link_port import free_port
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
 
 from terrafix.processes import PROCESSES
-from terrafix_tools.sim.sitl import stages
-from terrafix_tools.sim.sitl.firmware import Home
-from terrafix_tools.sim.sitl.stages import Daemon
+from terrafix_lab.sim.sitl import stages
+from terrafix_lab.sim.sitl.firmware import Home
+from terrafix_lab.sim.sitl.stages import Daemon
 
 pytestmark = pytest.mark.real_time
 
@@ -28,8 +28,8 @@ FLIGHT = """
 import sys, time
 from pathlib import Path
 from types import SimpleNamespace
-from terrafix_tools.sim.sitl.firmware import Home
-from terrafix_tools.sim.sitl.stages import Daemon
+from terrafix_lab.sim.sitl.firmware import Home
+from terrafix_lab.sim.sitl.stages import Daemon
 scene = SimpleNamespace(home=Home(48.0002, 11.0002, 500.0, 90.0), map_path=Path(sys.argv[2]))
 with Daemon(Path(sys.argv[1]), scene, sys.argv[3], sys.argv[4]) as daemon:
     daemon.start()

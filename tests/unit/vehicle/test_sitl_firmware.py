@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from terrafix.core.errors import UsageError
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.sitl.firmware import Firmware, Home, Ports, find_binary, kind_of, take_ports
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.sitl.firmware import Firmware, Home, Ports, find_binary, kind_of, take_ports
 
 HOME = Home(48.0, 14.0, 320.0, 90.0)
 

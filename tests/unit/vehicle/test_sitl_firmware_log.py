@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from autopilot_logs import FORMATS, Row, write_dataflash
-from terrafix_tools.sim.sitl.firmware_log import firmware_figures, text_lines
+from terrafix_lab.sim.sitl.firmware_log import firmware_figures, text_lines
 
 SIM = {"SIM": ("QffffLLfffff", "TimeUS,Roll,Pitch,Yaw,Alt,Lat,Lng,Q1,Q2,Q3,Q4,X")}
 

@@ -6,7 +6,7 @@ from terrafix_tools.mission.items import AltitudeFrame, Do, Item, Mission
 
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
 
-from terrafix_tools.sim.sitl.ground_side import items  # imports mavsdk
+from terrafix_lab.sim.sitl.ground_side import items  # imports mavsdk
 
 MISSION = Mission(
     "test",

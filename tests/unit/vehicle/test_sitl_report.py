@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix_tools.sim.sitl.firmware import Home
-from terrafix_tools.sim.sitl.observer import (
+from terrafix_lab.sim.sitl.firmware import Home
+from terrafix_lab.sim.sitl.observer import (
     SO_TIMESTAMPNS,
     FlightLog,
     Observer,
@@ -25,7 +25,7 @@ from terrafix_tools.sim.sitl.observer import (
     interpolate,
     record,
 )
-from terrafix_tools.sim.sitl.report import (
+from terrafix_lab.sim.sitl.report import (
     Figures,
     Interruption,
     Times,

@@ -8,10 +8,10 @@ import pytest
 from pyproj import Geod
 
 from terrafix.core.errors import UsageError
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.sitl.setup import WORLD_M, laps_for, mission_for, place_of, write_parameters
+from terrafix_lab.sim.world import place as world
 from terrafix_tools.mission.items import Do, Mission
-from terrafix_tools.sim.autopilot.parameters import Kind
-from terrafix_tools.sim.sitl.setup import WORLD_M, laps_for, mission_for, place_of, write_parameters
-from terrafix_tools.sim.world import place as world
 
 GEOD = Geod(ellps="WGS84")
 

@@ -12,11 +12,11 @@ from rich.console import Console
 pytest.importorskip("mavsdk", reason="mavsdk is not installed (pip install 'terrafix[sim]')")
 
 from terrafix.core.errors import LinkError, UsageError
-from terrafix_tools.sim.sitl import stages as sitl_stages
-from terrafix_tools.sim.sitl.firmware import Home
-from terrafix_tools.sim.sitl.fly import Disturbance
-from terrafix_tools.sim.sitl.observer import FlightLog, StatusTextRecord, Truth
-from terrafix_tools.sim.sitl.stages import FlightAborted, Stages
+from terrafix_lab.sim.sitl import stages as sitl_stages
+from terrafix_lab.sim.sitl.firmware import Home
+from terrafix_lab.sim.sitl.fly import Disturbance
+from terrafix_lab.sim.sitl.observer import FlightLog, StatusTextRecord, Truth
+from terrafix_lab.sim.sitl.stages import FlightAborted, Stages
 
 HOME = Home(48.0, 14.0, 320.0, 90.0)
 
@@ -242,7 +242,7 @@ def test_the_vehicle_has_landed_when_it_disarms() -> None:
 def test_the_camera_description_is_valid(tmp_path: Path) -> None:
     from terrafix.core.config import load
     from terrafix.vision.sources.description import camera_of, read_description
-    from terrafix_tools.sim.flights.folder import CAMERA
+    from terrafix_lab.sim.flights.folder import CAMERA
 
     scene: Any = SimpleNamespace(home=HOME, map_path=tmp_path / "map.gpkg")
     sitl_stages.Daemon(tmp_path, scene, "http://127.0.0.1:1/", "udpin:127.0.0.1:2")

@@ -11,7 +11,7 @@ from terrafix.core.limits import WINDOW_NODES
 from terrafix.messages import Verdict
 from terrafix.vision import covisibility
 from terrafix.vision.feature_tracker import MAX_FAILURES, MAX_PAIRS, FrameTracker, Motion
-from terrafix_tools.sim.true_messages import apply, homography
+from terrafix_lab.sim.true_messages import apply, homography
 from textured_ground import PINHOLE, rotation, texture, view
 
 AGL_M = 100.0

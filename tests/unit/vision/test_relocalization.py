@@ -6,7 +6,7 @@ import pytest
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.messages import OVERTAKEN, Frame, Message, Odometry, Relocalization, Verdict
 from terrafix.vision.node import VisionNode
-from terrafix_tools.sim.true_messages import apply, homography
+from terrafix_lab.sim.true_messages import apply, homography
 from textured_ground import PINHOLE, rotation, texture, view
 from vision_origin import PINHOLE_ORIGIN as ORIGIN
 

@@ -16,7 +16,7 @@ from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources import Shot, Source, open_source
 from terrafix.vision.sources.mjpeg import TIMEOUT_S
-from terrafix_tools.sim.camera.stream import FrameStream
+from terrafix_lab.sim.camera.stream import FrameStream
 
 pytestmark = pytest.mark.real_time
 

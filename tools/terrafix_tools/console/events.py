@@ -21,7 +21,7 @@ class FrameRefined(Event):
     frame_id: int
     gps: Gps
     refined: bool = True
-    altitude: float
+    altitude: float | None
     ellipse: Ellipse
     source: str  # "smoother" (during the flight), "flight" (after its end)
     fragment_id: int

@@ -214,7 +214,7 @@ class FrameResult(BaseModel):
     heading: float | None = None  # degrees, clockwise from true north
     confidence: float | None = None
     ellipse: Ellipse | None = None
-    source: str = ""  # "satellite_anchored", "visual_propagated", "dead_reckoned"
+    source: str = ""  # "satellite_anchored", "visual_propagated", "dead_reckoned", "not_placed"
     match: str = ""  # verdict of the map match
     inliers: int = 0
     search: str = "normal"  # step of the search

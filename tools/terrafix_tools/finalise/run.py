@@ -159,6 +159,8 @@ def _smoothed(
             lost[int(found.begins[node])] += 1
         elif frame_id in rows:
             _fill(rows[frame_id], track[frame_id], frame, r_b_c)
+            if not estimator.state.amsl_known:
+                rows[frame_id].alt_amsl_m = None
     why = "no map match is accepted there, and its start is unknown"
     summary = _summary(flight, found, choice, [{"frames": count, "why": why} for count in lost.values()])
     cameras = {frame_id: found.poses[node] for frame_id, node in flight.node_of.items() if found.placed[node]}

@@ -23,10 +23,9 @@ from terrafix_engines.manifest import Manifest
 from terrafix_engines.providers import CPU, PREFERENCE, short_name
 from terrafix_engines.runtime import Model, default_sizes, noise
 from terrafix_engines.store import StoredModel
-from terrafix_tools.bench.flights import spread
-from terrafix_tools.bench.run import machine
 from terrafix_tools.models.known import as_model_errors, fetched_models
 from terrafix_tools.models.listing import open_complete
+from terrafix_tools.timing import machine, spread
 
 MAX_TIME_S = 20.0  # time limit per input size: a slow model gets fewer runs
 MIN_RUNS = 3

@@ -62,7 +62,7 @@ def facts(view: FlightView, moment: Moment, own: FrameRecord, shown: FrameRecord
 def _position(view: FlightView, moment: Moment) -> str:
     row = view.rows[moment.row]
     if not row.localised:
-        return "none"
+        return "not placed: no map match yet, and no known start" if row.source_label == "not_placed" else "none"
     parts = [SOURCES.get(row.source_label, "")]
     if (radius_m := radius95_m(row)) is not None:
         parts.append(f"95 % radius {radius_m:.1f} m")

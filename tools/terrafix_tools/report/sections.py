@@ -12,6 +12,7 @@ LABELS = {
     "satellite_anchored": "map match",
     "visual_propagated": "propagated by odometry",
     "dead_reckoned": "dead reckoning",
+    "not_placed": "not placed",
     "": "no position",
 }
 

@@ -13,6 +13,7 @@ SOURCES = {
     "satellite_anchored": "map match",
     "visual_propagated": "odometry since the last map match",
     "dead_reckoned": "dead reckoning",
+    "not_placed": "not found on the map yet",
 }
 
 
@@ -29,10 +30,12 @@ def _position(found: dict[str, Any]) -> Table:
     text = f"3D fix, accuracy {position['accuracy_m']} m" if fix else f"no fix: {position['reason'] or 'not known why'}"
     table.add_row("GPS_INPUT", Text(text, GOOD if fix else BAD))
     if "lat_deg" in position:
-        table.add_row(
-            "estimate", f"{position['lat_deg']:.6f}, {position['lon_deg']:.6f}, {position['alt_amsl_m']} m AMSL"
-        )
-        table.add_row("95 % radius", f"{position['radius_95_m']} m ({SOURCES[position['source']]})")
+        if position["lat_deg"] is None:
+            table.add_row("estimate", Text(f"position unknown: {SOURCES[position['source']]}", BAD))
+        else:
+            height = "elevation unknown" if position["alt_amsl_m"] is None else f"{position['alt_amsl_m']} m AMSL"
+            table.add_row("estimate", f"{position['lat_deg']:.6f}, {position['lon_deg']:.6f}, {height}")
+            table.add_row("95 % radius", f"{position['radius_95_m']} m ({SOURCES[position['source']]})")
         table.add_row("height, speed", f"{position['agl_m']} m above ground, {position['speed_mps']} m/s")
     table.add_row("last map fix", _with_unit(position["since_map_fix_s"], "s ago"))
     table.add_row("search", str(position["search"] or "-"))

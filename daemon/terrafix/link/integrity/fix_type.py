@@ -21,7 +21,10 @@ MAX_AGE_NS = 2_000_000_000
 SILENCE_AFTER_NS = 35_000_000_000  # ns; last degradation level, by then every vehicle has rejected this GPS [tuned]
 MAX_HORIZONTAL_SIGMA_M = 50.0  # m; the autopilot's gate is 7 times this, above it any position would pass [tuned]
 RECOVERY_HORIZONTAL_SIGMA_M = 40.0  # m; hysteresis: narrower limit for the return to fix type 3 [tuned]
-RECOVERY_SPEED_SIGMA_MPS = 1.45  # m/s; hysteresis, as above [tuned]
+RECOVERY_AGE_NS = 1_500_000_000  # ns; hysteresis, as above [tuned]
+# A fix that was withdrawn stays away this long: a computer that is too slow would send it on and off, and the EKF takes
+# the velocity of each return anew. It is half of the time within which the autopilot must use a returned position.
+MIN_NO_FIX_NS = 1_000_000_000  # ns [spec: ON-6]
 # The autopilot applies a peak hold with a time constant of 5 s to the reported accuracy: one bad report keeps its gate
 # open for about 15 s. A sudden increase therefore lowers the fix type at first, and is reported only if it lasts.
 SPIKE_RATIO = 3.0  # accuracy over the last one that was sent [tuned]
@@ -60,6 +63,9 @@ class NoFixReason:
 # The computer was restarted in flight: the start coordinate is the place of take-off, with a small stated sigma.
 STARTED_IN_FLIGHT = NoFixReason("started in flight, and no map fix yet", "the map must confirm the start")
 
+# No map match yet, and no start that is known to 100 m.
+NOT_PLACED = NoFixReason("not found on the map yet", "not found on the map yet")
+
 
 class FixGate:
     """Decides the fix type at every transmission. Its state: hysteresis, and the wait for a better accuracy."""
@@ -67,6 +73,7 @@ class FixGate:
     def __init__(self) -> None:
         self.has_fix = False
         self._sent: tuple[int, float] | None = None  # ns, m: time and horizontal accuracy of the last 3D fix
+        self._withdrawn: tuple[int, NoFixReason] | None = None  # time [ns] and reason of the end of the last 3D fix
         self._awaited_since_ns: int | None = None  # since when the accuracy is worse than the autopilot takes well
 
     def withdraw(self) -> None:
@@ -80,6 +87,12 @@ class FixGate:
 
         ``accuracy_m``: horizontal accuracy that would be sent, 1-sigma. ``level``: degradation level."""
         reason = self._no_fix_reason(predicted, accuracy_m, level, label)
+        if self._withdrawn is not None and predicted.t_ns - self._withdrawn[0] < MIN_NO_FIX_NS:
+            reason = reason or self._withdrawn[1]
+        if reason is None:
+            self._withdrawn = None
+        elif self.has_fix:
+            self._withdrawn = predicted.t_ns, reason
         self.has_fix = reason is None
         if self.has_fix:
             self._sent = predicted.t_ns, accuracy_m
@@ -88,8 +101,10 @@ class FixGate:
     def _no_fix_reason(
         self, predicted: PredictedState, accuracy_m: float, level: int, label: SourceLabel
     ) -> NoFixReason | None:
-        if predicted.age_s * 1e9 > MAX_AGE_NS:
+        if predicted.age_s * 1e9 > (MAX_AGE_NS if self.has_fix or self._sent is None else RECOVERY_AGE_NS):
             return NoFixReason(f"estimate is {predicted.age_s:.1f} s old", "the estimate is too old")
+        if label is SourceLabel.NOT_PLACED:
+            return NOT_PLACED
         if level == len(DEGRADATION_LEVELS) - 1 and label is SourceLabel.DEAD_RECKONED:
             text = f"no map and no odometry, {DEGRADATION_LEVELS[-1][0]:.0f} s without a map fix"
             return NoFixReason(text, "neither map nor odometry")
@@ -99,8 +114,7 @@ class FixGate:
                 f"accuracy {accuracy_m:.0f} m is worse than {limit_m:.0f} m", f"worse than {limit_m:.0f} m"
             )
         after_gap = self._sent is not None and predicted.t_ns - self._sent[0] >= ALIGNMENT_GAP_NS
-        recovery_mps = FIRST_SPEED_SIGMA_MPS if after_gap else RECOVERY_SPEED_SIGMA_MPS
-        limit_mps = MAX_SENT_VELOCITY_SIGMA_MPS if self.has_fix else recovery_mps
+        limit_mps = MAX_SENT_VELOCITY_SIGMA_MPS if self.has_fix else FIRST_SPEED_SIGMA_MPS
         if predicted.speed_sigma_mps > limit_mps:
             text = f"speed accuracy {predicted.speed_sigma_mps:.1f} m/s is worse than {limit_mps:.1f} m/s"
             return NoFixReason(text, "the speed is too uncertain")

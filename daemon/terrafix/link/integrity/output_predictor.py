@@ -148,7 +148,7 @@ def predict_to(estimate: NavEstimate, now_ns: int, inertial: InertialBuffer) -> 
         alt_amsl_m=estimate.alt_amsl_m + vu * age_s + delta_p[2],
         velocity_enu_mps=(ve + delta_v[0], vn + delta_v[1], vu + delta_v[2]),
         horizontal_sigma_m=math.sqrt(worst_horizontal_variance(estimate.cov) + process_noise_m2),
-        vertical_sigma_m=math.sqrt(max(0.0, estimate.cov[UU]) + process_noise_m2),
+        vertical_sigma_m=math.sqrt(max(0.0, estimate.cov[UU]) + process_noise_m2) if estimate.amsl_known else math.inf,
         speed_sigma_mps=math.hypot(estimate.velocity_sigma_mps, accel_sigma * age_s, heading_error_mps),
     )
 

@@ -17,7 +17,7 @@ from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.monitors.visual_motion import image_turn
 from terrafix.estimator.prior import CheckpointWriter, load_checkpoint
 from terrafix.messages import CameraVehicle, CandidateAttitude, Message, ServedVehicle, VehicleState
-from terrafix_tools.sim.true_messages import apply, homography
+from terrafix_lab.sim.true_messages import apply, homography
 
 FRAME_S, ATTITUDE_S = 0.5, 0.1
 UNKNOWN = Attitude(None, None, None, None)

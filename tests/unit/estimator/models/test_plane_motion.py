@@ -8,7 +8,7 @@ from terrafix.core.pose import exp_so3, log_so3
 from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.models.plane_motion import Ground, RelativePose, relative_pose
 from terrafix.vision.feature_tracker import FrameTracker
-from terrafix_tools.sim.true_messages import apply, homography
+from terrafix_lab.sim.true_messages import apply, homography
 from textured_ground import PINHOLE, rotation, texture, view
 
 AGL_M = 100.0

@@ -13,7 +13,7 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
-from terrafix_tools.sim.autopilot.peer import AutopilotPeer
+from terrafix_lab.sim.autopilot.peer import AutopilotPeer
 
 pytestmark = pytest.mark.real_time
 

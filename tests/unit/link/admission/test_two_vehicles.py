@@ -20,9 +20,9 @@ from terrafix.core.geodesy import LocalFrame, rot_w_b
 from terrafix.estimator.node import EstimatorNode
 from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
-from terrafix_tools.sim.autopilot.course import PeerState
-from terrafix_tools.sim.autopilot.peer import AutopilotPeer
-from terrafix_tools.sim.true_messages import seen_from
+from terrafix_lab.sim.autopilot.course import PeerState
+from terrafix_lab.sim.autopilot.peer import AutopilotPeer
+from terrafix_lab.sim.true_messages import seen_from
 
 pytestmark = pytest.mark.real_time
 

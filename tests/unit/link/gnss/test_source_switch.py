@@ -15,7 +15,7 @@ from terrafix import messages as m
 from terrafix.core.config import LinkSection
 from terrafix.link.gnss.previous_source import FILE_NAME, PreviousSource, PreviousSourceFile
 from terrafix.link.gnss.source_switch import SourceSwitch
-from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
+from terrafix_lab.sim.autopilot.parameters import BESIDE_A_RECEIVER, Kind
 
 BEFORE = {"GPS_AUTO_SWITCH": 4.0, "GPS_PRIMARY": 0.0}
 SPOOFED_S = 15.0

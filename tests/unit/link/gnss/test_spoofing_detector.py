@@ -14,8 +14,8 @@ from terrafix.link.autopilot.gnss_receiver import gnss_reading
 from terrafix.link.gnss.monitor import MIN_VISION_NS
 from terrafix.link.node import LinkNode
 from terrafix.messages import GnssState
-from terrafix_tools.sim.gnss_evaluation.flight import Vision, fly
-from terrafix_tools.sim.gnss_evaluation.table import summary, table
+from terrafix_lab.sim.gnss_evaluation.flight import Vision, fly
+from terrafix_lab.sim.gnss_evaluation.table import summary, table
 
 
 def verdicts(published: list[m.Message]) -> list[tuple[float, GnssState]]:

@@ -17,7 +17,7 @@ MAX_CHARACTERS = 50  # characters of STATUSTEXT
 KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"3D fix",
     r"no fix: (the estimate is too old|neither map nor odometry|worse than \d+ m|the speed is too uncertain)",
-    r"no fix: awaiting a better accuracy",
+    r"no fix: (awaiting a better accuracy|not found on the map yet)",
     r"no fix: (suddenly less accurate|the position has jumped|no estimate yet|estimator (died|stuck|gave up))",
     r"no map fix for (5|15|35) s",
     r"map fix again",

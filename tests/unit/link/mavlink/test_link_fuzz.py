@@ -1,12 +1,12 @@
-"""A short fuzz run on a bad connection: no crash, no wrong GPS_INPUT. See also terrafix_tools.sim.autopilot.fuzz."""
+"""A short fuzz run on a bad connection: no crash, no wrong GPS_INPUT. See also terrafix_lab.sim.autopilot.fuzz."""
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from link_wire import attitude, packed
 from terrafix.link.mavlink.framing import Framer
-from terrafix_tools.sim.autopilot.fuzz import fuzz
-from terrafix_tools.sim.autopilot.fuzz_wire import BadWire
+from terrafix_lab.sim.autopilot.fuzz import fuzz
+from terrafix_lab.sim.autopilot.fuzz_wire import BadWire
 
 
 @pytest.mark.parametrize("signed", [False, True])

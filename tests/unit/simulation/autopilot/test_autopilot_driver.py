@@ -6,8 +6,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from autopilot_rig import HOME_M, LAT, LON, Rig, changed
-from terrafix_tools.sim.autopilot.navigation.gps import GpsInputDriver
-from terrafix_tools.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.autopilot.navigation.gps import GpsInputDriver
+from terrafix_lab.sim.autopilot.parameters import Kind
 
 ACCURACIES = (
     mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY

@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from autopilot_rig import FRAME, GOOD, HEIGHT_M, LAT, LON, Gps, Rig, at_5_hz, changed, real_fix
 from terrafix.link.integrity.output_predictor import offset
-from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, Kind
-from terrafix_tools.sim.autopilot.report import PeerMonitor
-from terrafix_tools.sim.interfaces import State
+from terrafix_lab.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, Kind
+from terrafix_lab.sim.autopilot.report import PeerMonitor
+from terrafix_lab.sim.interfaces import State
 
 ABSOLUTE, RELATIVE, VELOCITY, GLITCH, CONSTANT = 16, 8, 2, 32768, 128  # EKF_STATUS_REPORT.flags
 BOTH = pytest.mark.parametrize("kind", list(Kind))

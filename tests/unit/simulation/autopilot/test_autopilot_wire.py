@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from autopilot_rig import FRAME, GOOD, HEIGHT_M, HOME_M, LAT, LON, Rig, at_5_hz, changed, real_fix
 from terrafix.core.errors import UsageError
-from terrafix_tools.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, Kind, parameters_of
-from terrafix_tools.sim.closed_loop.loopback import Loopback
+from terrafix_lab.sim.autopilot.parameters import BESIDE_A_RECEIVER, FIRMWARE, Kind, parameters_of
+from terrafix_lab.sim.closed_loop.loopback import Loopback
 
 STREAMS = (
     "HEARTBEAT",

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
-from terrafix_tools.montecarlo import lies as of
-from terrafix_tools.montecarlo.fault import LIES, Fault
-from terrafix_tools.montecarlo.flight import Record
-from terrafix_tools.montecarlo.flown import Shot, SimulatedFlight, fly
-from terrafix_tools.montecarlo.ground import Terrain
-from terrafix_tools.montecarlo.lies import Lies, Search
-from terrafix_tools.montecarlo.plan import FlightPlan, plan
-from terrafix_tools.montecarlo.statistics import FlightResult
+from terrafix_lab.montecarlo import lies as of
+from terrafix_lab.montecarlo.fault import LIES, Fault
+from terrafix_lab.montecarlo.flight import Record
+from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight, fly
+from terrafix_lab.montecarlo.ground import Terrain
+from terrafix_lab.montecarlo.lies import Lies, Search
+from terrafix_lab.montecarlo.plan import FlightPlan, plan
+from terrafix_lab.montecarlo.statistics import FlightResult
 
 SHORT_S = 60.0
 FOUND = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", inliers=20)

@@ -15,17 +15,17 @@ from terrafix.core.geodesy import quat_from_rot, rot_w_b
 from terrafix.core.pnp import solved
 from terrafix.estimator.measurements.odometry import OdometryMeasurement
 from terrafix.messages import MapMatch, Prediction, Verdict
-from terrafix_tools.montecarlo.fault import LIES, Fault
-from terrafix_tools.montecarlo.faults import JUMP_M, JUMPS, Faults
-from terrafix_tools.montecarlo.flight import find_match, run
-from terrafix_tools.montecarlo.flown import Shot, SimulatedFlight, fly
-from terrafix_tools.montecarlo.ground import MapError, Terrain
-from terrafix_tools.montecarlo.lens import Lens
-from terrafix_tools.montecarlo.matches import MapMatches
-from terrafix_tools.montecarlo.plan import FlightPlan, plan
-from terrafix_tools.montecarlo.run import PICTURE, RESULT, RunOptions, montecarlo
-from terrafix_tools.montecarlo.sightings import SimulatedOdometry
-from terrafix_tools.montecarlo.statistics import FlightResult
+from terrafix_lab.montecarlo.fault import LIES, Fault
+from terrafix_lab.montecarlo.faults import JUMP_M, JUMPS, Faults
+from terrafix_lab.montecarlo.flight import find_match, run
+from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight, fly
+from terrafix_lab.montecarlo.ground import MapError, Terrain
+from terrafix_lab.montecarlo.lens import Lens
+from terrafix_lab.montecarlo.matches import MapMatches
+from terrafix_lab.montecarlo.plan import FlightPlan, plan
+from terrafix_lab.montecarlo.run import PICTURE, RESULT, RunOptions, montecarlo
+from terrafix_lab.montecarlo.sightings import SimulatedOdometry
+from terrafix_lab.montecarlo.statistics import FlightResult
 
 SHORT_S = 60.0
 

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafix_tools.montecarlo.endurance import RestartComparison, slopes
-from terrafix_tools.montecarlo.fault import Fault
-from terrafix_tools.montecarlo.flight import run
-from terrafix_tools.montecarlo.plan import plan
-from terrafix_tools.montecarlo.statistics import band, draws_in, floors, whitened
+from terrafix_lab.montecarlo.endurance import RestartComparison, slopes
+from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.montecarlo.flight import run
+from terrafix_lab.montecarlo.plan import plan
+from terrafix_lab.montecarlo.statistics import band, draws_in, floors, whitened
 from terrafix_tools.score import nees_band, nees_of
 
 

@@ -19,6 +19,7 @@ from terrafix.messages import (
     Refinement,
     SearchPlaces,
     SearchStep,
+    SourceLabel,
     Verdict,
 )
 from terrafix_tools.console.events import (
@@ -269,10 +270,12 @@ def _result(shown: Frame, estimate: NavEstimate | None, found: MapMatch | None, 
         result.match, result.inliers, result.search = str(found.verdict), found.inliers, str(found.search.step)
     if estimate is not None:
         cov_m2 = np.reshape(estimate.cov, (6, 6))[:2, :2]
-        result.gps = _gps(estimate.lat_deg, estimate.lon_deg)
-        result.altitude, result.agl_m = round(estimate.alt_amsl_m, 3), round(estimate.agl_m, 3)
+        if estimate.source_label is not SourceLabel.NOT_PLACED:
+            result.gps = _gps(estimate.lat_deg, estimate.lon_deg)
+            result.confidence, result.ellipse = confidence_of(cov_m2), ellipse_of(cov_m2)
+        result.altitude = round(estimate.alt_amsl_m, 3) if estimate.amsl_known else None
+        result.agl_m = round(estimate.agl_m, 3)
         result.heading = round(yaw_deg_of(estimate), 3)
-        result.confidence, result.ellipse = confidence_of(cov_m2), ellipse_of(cov_m2)
         result.source = str(estimate.source_label)
         result.fragment_id, result.joined = estimate.fragment_id, estimate.joined
     return result
@@ -283,7 +286,7 @@ def _refined(pose: RefinedPose, source: str) -> FrameRefined:
     return FrameRefined(
         frame_id=pose.frame_id,
         gps=_gps(pose.lat_deg, pose.lon_deg),
-        altitude=round(pose.alt_amsl_m, 3),
+        altitude=None if pose.alt_amsl_m is None else round(pose.alt_amsl_m, 3),
         ellipse=ellipse_of(cov_m2),
         source=source,
         fragment_id=pose.fragment_id,

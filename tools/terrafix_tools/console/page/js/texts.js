@@ -21,7 +21,7 @@ const EN = {
   speed: "{0} over ground", frame: "Frame", as_of: "as of {0}", updated: "updated {0} ago", no_news: "no news since opened", completed_line: "flight completed", last_match: "Last map match",
   no_match_yet: "none yet", now: "this frame", ago: "{0} ago", of_frame: "frame {0}", sent_fix: "Sent to autopilot", fix_3d: "3D fix", fix_none: "no fix",
   facts_old: "Old: Terrafix has reported nothing since {0}.", no_facts: "Terrafix reports nothing at present", stale: "Old data", source_satellite_anchored: "map match", source_visual_propagated: "odometry",
-  source_dead_reckoned: "dead reckoning", source_none: "no position", search_widen: "search is widened", search_whole_map: "searching the whole map",
+  source_dead_reckoned: "dead reckoning", source_none: "no position", source_not_placed: "not placed yet", search_widen: "search is widened", search_whole_map: "searching the whole map",
   search_skip: "frame not usable", search_new_fragment: "new fragment", search_merge: "fragment tied", search_ask: "asks for a position",
   lost_line: "Connection lost {0} ago. Everything below is as of {1}. Trying again.", lost_said: "Connection to the service lost",
   // map
@@ -96,7 +96,7 @@ const DE = {
   speed: "{0} über Grund", frame: "Einzelbild", as_of: "Stand {0}", updated: "vor {0} aktualisiert", no_news: "seit dem Öffnen nichts Neues", completed_line: "Flug abgeschlossen", last_match: "Letzter Kartenabgleich",
   no_match_yet: "noch keiner", now: "dieses Bild", ago: "vor {0}", of_frame: "Bild {0}", sent_fix: "An den Autopiloten gesendet", fix_3d: "3D-Position", fix_none: "keine Position",
   facts_old: "Veraltet: Terrafix meldet seit {0} nichts mehr.", no_facts: "Terrafix meldet derzeit nichts", stale: "Veraltet", source_satellite_anchored: "Kartenabgleich", source_visual_propagated: "optische Wegmessung",
-  source_dead_reckoned: "Koppelnavigation", source_none: "keine Position", search_widen: "Suche wird ausgeweitet", search_whole_map: "Suche auf der ganzen Karte",
+  source_dead_reckoned: "Koppelnavigation", source_none: "keine Position", source_not_placed: "noch nicht verortet", search_widen: "Suche wird ausgeweitet", search_whole_map: "Suche auf der ganzen Karte",
   search_skip: "Bild nicht verwertbar", search_new_fragment: "neues Teilstück", search_merge: "Teilstück verbunden", search_ask: "bittet um eine Position",
   lost_line: "Verbindung seit {0} unterbrochen. Alle Werte unten haben den Stand {1}. Neuer Versuch läuft.", lost_said: "Verbindung zum Dienst unterbrochen",
   map: "Karte", map_help: "Karte. Pfeiltasten verschieben, Plus und Minus ändern den Maßstab; beim Messen setzt die Eingabetaste einen Punkt am Fadenkreuz", zoom_in: "Vergrößern",

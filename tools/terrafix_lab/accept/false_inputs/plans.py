@@ -1,0 +1,191 @@
+"""Plans of scenarios with a false input ("lie"): its span and its edits."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.core.node import Image
+from terrafix.messages import Origin
+from terrafix_lab.accept.false_inputs import inputs as lying
+from terrafix_lab.accept.false_inputs import maps as lying_maps
+from terrafix_lab.accept.faults import flight_edits
+from terrafix_lab.accept.faults.flight_edits import Edit
+from terrafix_lab.accept.flight import Flight
+from terrafix_lab.accept.measuring.results import Marks, Span
+from terrafix_lab.accept.plan import Plan
+
+MIN_FRAMES = 24  # of a flight, for frames before and after the lie
+MIN_DURATION = 2.5  # of a flight over that of the lie, for time before and after it
+START = 0.4  # share of the frames before a lie that ends before the flight
+FOREIGN_ROW, FOREIGN_SHARE, INTERLEAVED = 10, 0.15, 30  # frames, share, frames
+FAST = 3  # speed over that of the flight: successive pictures still overlap by two thirds
+FAR_M = 150.0  # at least: more than a footprint, and three times the error of a false fix
+START_ERROR_M = np.array([212.0, 212.0])  # 300 m
+START_SIGMA_M = 50.0
+PHOTO_M = 155.0
+GAP_FRAMES, GAP_MORE_S = 16, 170.0
+
+
+def _too_short(flight: Flight) -> str:
+    return "" if len(flight.frame_refs) >= MIN_FRAMES else f"the flight has only {len(flight.frame_refs)} frames"
+
+
+def _span(flight: Flight, first: int, last: int, text: str) -> Span:
+    """From frame ``first`` to frame ``last``, both included; ``last`` is limited to the flight."""
+    frame_refs = flight.frame_refs
+    return Span(frame_refs[first].t_s, frame_refs[min(last, len(frame_refs) - 1)].t_s, text)
+
+
+def _lying(span: Span, **plan: object) -> Plan:
+    return Plan(marks=Marks(spans=(span,), lie=span), **plan)  # type: ignore[arg-type]
+
+
+def throughout(text: str, **plan: object) -> Callable[[Flight], Plan | str]:
+    """The lie lasts from the first frame to the last."""
+    return lambda flight: _lying(_span(flight, 0, len(flight.frame_refs) - 1, text), **plan)
+
+
+def for_seconds(seconds: float, text: str, edit: Callable[[Span], Edit]) -> Callable[[Flight], Plan | str]:
+    """The lie begins after the share START of the frames and lasts for ``seconds``."""
+
+    def plan(flight: Flight) -> Plan | str:
+        if flight.duration_s < MIN_DURATION * seconds:
+            return f"the flight lasts only {flight.duration_s:.0f} s"
+        from_s = flight.frame_refs[flight.at(START)].t_s
+        span = Span(from_s, from_s + seconds, text)
+        return _lying(span, edit=edit(span))
+
+    return plan
+
+
+# --- pictures of another place ---
+
+
+def _another_camera(flight: Flight, numbers: list[int], pace: int = 1) -> Plan | str:
+    """The frames ``numbers`` show pictures of another camera, which match each other and not the map: the flight's own,
+    half of its frames later, mirrored. They advance at ``pace`` times the speed of the flight."""
+    if why := _too_short(flight):
+        return why
+    half = len(flight.frame_refs) // 2
+    shown = {n: (numbers[0] + half + pace * (n - numbers[0])) % len(flight.frame_refs) for n in numbers}
+    return _pictures_of(flight, shown, lying.mirrored, "pictures of another place")
+
+
+def _pictures_of(flight: Flight, shown: dict[int, int], change: Callable[[Image], Image], text: str) -> Plan:
+    """``shown``: index of a frame -> index of the frame whose picture it shows."""
+
+    def load(number: int) -> Image:
+        return change(flight.picture(number))
+
+    pictures = {flight.frame_refs[n].file: partial(load, other) for n, other in shown.items()}
+    return _lying(_span(flight, min(shown), max(shown), text), edit=lying.replaced(pictures))
+
+
+def foreign_row(at: float = START, pace: int = 1) -> Callable[[Flight], Plan | str]:
+    """From the share ``at`` of the frames on."""
+
+    def plan(flight: Flight) -> Plan | str:
+        start = flight.at(at)
+        return _another_camera(flight, list(range(start, start + FOREIGN_ROW)), pace)
+
+    return plan
+
+
+def foreign_at_random(flight: Flight) -> Plan | str:
+    drawn = np.random.default_rng([lying.SEED, 70]).uniform(size=len(flight.frame_refs)) < FOREIGN_SHARE
+    numbers = [int(n) for n in np.flatnonzero(drawn) if 0.1 <= n / len(flight.frame_refs) <= 0.8]
+    return _another_camera(flight, numbers) if numbers else "too few frames to have a foreign one"
+
+
+def interleaved(flight: Flight) -> Plan | str:
+    start = flight.at(START)
+    return _another_camera(flight, list(range(start, min(start + INTERLEAVED, flight.at(0.8)), 2)))
+
+
+def elsewhere_reversed(flight: Flight) -> Plan | str:
+    """Ten pictures of the flight itself, from another part of the map, in reverse order."""
+    if why := _too_short(flight):
+        return why
+    track, start = flight.track_m(), flight.at(START)
+    away = np.hypot(*(track - track[start]).T)
+    away[: FOREIGN_ROW - 1] = np.nan  # the reverse sequence needs as many frames before it
+    if not np.any(away >= FAR_M):
+        return f"no two places of the flight are {FAR_M:.0f} m apart"
+    far = int(np.nanargmax(away))
+    return _pictures_of(flight, {start + k: far - k for k in range(FOREIGN_ROW)}, lambda i: i, "pictures of elsewhere")
+
+
+# --- maps ---
+
+
+def with_map(
+    text: str,
+    change: Callable[[Flight, Path, Path], str],
+    origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin,
+) -> Callable[[Flight], Plan | str]:
+    """``change`` (flight, map of the flight, map to write) makes the map of the scenario."""
+
+    def plan(flight: Flight) -> Plan | str:
+        if not flight.has_raster_map:
+            return "needs the map as a GeoTIFF, to change it"
+        span = _span(flight, 0, len(flight.frame_refs) - 1, text)
+        return _lying(span, other_map=partial(change, flight), origin=origin)
+
+    return plan
+
+
+def other_town(flight: Flight, given: Path, out: Path) -> str:
+    if flight.other_map is not None:
+        return lying_maps.put_in_place_of(flight.other_map, given, out)
+    return lying_maps.mirrored(given, out)
+
+
+def shifted_map(by_m: tuple[float, float], _: Flight, given: Path, out: Path) -> str:
+    return lying_maps.shifted(given, out, *by_m)
+
+
+def grown_map(flight: Flight, given: Path, out: Path) -> str:
+    return lying_maps.scaled(
+        given, out, 1.10, flight.truth[next(s.file for s in flight.frame_refs if s.file in flight.truth)]
+    )
+
+
+# --- start, and true inputs with gaps ---
+
+
+def start_off(flight: Flight) -> Plan:
+    """The lie is in the Origin only, so that its span is the first frame."""
+    ahead = np.where(
+        np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0
+    )  # towards the centre of the flight, where the map is
+    east_m, north_m = (ahead * START_ERROR_M).tolist()
+    return _lying(
+        _span(flight, 0, 0, "the start is 300 m off"), origin=flight_edits.start_moved(east_m, north_m, START_SIGMA_M)
+    )
+
+
+def sparse_photos(flight: Flight) -> Plan | str:
+    track = flight.track_m()
+    chosen, last = [], None
+    for number, place in enumerate(track):
+        if np.isfinite(place).all() and (last is None or np.hypot(*(place - last)) >= PHOTO_M):
+            chosen.append(flight.frame_refs[number].file)
+            last = place
+    return (
+        Plan(lying.photos(frozenset(chosen)))
+        if len(chosen) >= 6
+        else f"only {len(chosen)} photos {PHOTO_M:.0f} m apart"
+    )
+
+
+def gap_of_minutes(flight: Flight) -> Plan | str:
+    if why := _too_short(flight):
+        return why
+    first = flight.at(START)
+    end = min(first + GAP_FRAMES, flight.at(0.7))
+    span = Span(flight.frame_refs[first - 1].t_s, flight.frame_refs[end].t_s + GAP_MORE_S, "no frames, no telemetry")
+    # The span ends before the first frame after the gap.
+    gap = Span(span.from_s, span.to_s - 1e-3, span.text)
+    return Plan(lying.pause(first, end, GAP_MORE_S), marks=Marks(spans=(gap,)))

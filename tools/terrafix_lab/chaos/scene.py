@@ -1,0 +1,130 @@
+"""The flight of the fault matrix: a copter over a generated place, from take-off to landing, with its phases."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.core.errors import SourceError
+from terrafix.messages import Camera
+from terrafix_lab.sim.autopilot.course import Course, PeerState, peer_state_of, read_course, write_course
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.flights.folder import CAMERA, FRAME_HZ, Flight
+from terrafix_lab.sim.flights.make import MAP_NAME, FlightOptions, make
+from terrafix_lab.sim.world import place as world
+from terrafix_tools.mission.file import write_mission
+from terrafix_tools.mission.items import Do, Item, Mission
+
+AGL_M = 100.0
+LEG_M = 250.0  # of the two legs, east and then north
+WAY = ((LEG_M, 0.0), (LEG_M, LEG_M))
+STEP_S = 0.1  # of the course
+CRUISE_SHARE = 0.95  # of the greatest height
+STRAIGHT_RADPS = 0.05  # a turn is faster
+LEAD_S = 12.0  # flown before the fault, for the first fixes
+COURSE = "course.csv"
+
+
+class Phase(StrEnum):
+    """When the fault begins."""
+
+    START = "before the first fix"  # of the processes, in cruise
+    CRUISE = "cruise"
+    TURN = "turn"
+    DARK = "dark"  # in cruise; the images are black from 4 s before the fault to its end
+    LANDING = "landing"  # as the descent begins
+
+
+@dataclass(frozen=True)
+class Scene:
+    """``at_s``: seconds of the flight at which the fault of each phase begins. ``truth_sigma_m``: of the course.
+    ``attitude_sigma_deg``: of roll and pitch that are reported; None: the default."""
+
+    map_path: Path
+    jpegs: list[Path]
+    course: Course
+    at_s: dict[Phase, float]
+    duration_s: float
+    camera: Camera = CAMERA
+    frame_hz: float = FRAME_HZ
+    truth_sigma_m: float = 0.0
+    attitude_sigma_deg: float | None = None
+
+    def jpeg(self, t_s: float) -> bytes:
+        """The image whose exposure is nearest to a time of the flight."""
+        index = min(max(0, round(t_s * self.frame_hz)), len(self.jpegs) - 1)
+        return self.jpegs[index].read_bytes()
+
+
+def scene_in(folder: Path, seed: int) -> Scene:
+    """The flight in ``folder``, which is generated if it is not there. Raises OutputError, SourceError."""
+    if not (folder / COURSE).exists():
+        mission = folder.with_suffix(".waypoints")
+        write_mission(mission, mission_along("two legs", seed, WAY))
+        flight = make(folder, FlightOptions(seed=seed, vehicle=Kind.COPTER, mission=mission), progress=False)
+        course_of(flight, folder)
+    course = read_course(folder / COURSE)
+    jpegs = sorted((folder / "frames").glob("*.jpg"))
+    if not jpegs:
+        raise SourceError(f"{folder}: has no images; remove it, and it is generated anew")
+    duration_s = len(jpegs) / FRAME_HZ
+    return Scene(folder / MAP_NAME, jpegs, course, phases(course, duration_s), duration_s)
+
+
+def course_of(flight: Flight, folder: Path) -> Course:
+    """The true course of a flight, which is written into its folder. Raises OutputError, SourceError."""
+    write_course(folder / COURSE, _states(flight))
+    return read_course(folder / COURSE)
+
+
+def mission_along(name: str, seed: int, way_m: Sequence[tuple[float, float]]) -> Mission:
+    """Take-off in the middle of the place of ``seed``, legs at AGL_M above it along ``way_m`` (east and north of it),
+    landing at their end."""
+    place = world.generate(seed)
+    x, y = place.layout.width_m / 2, place.layout.height_m / 2
+    corners = [place.wgs84(x + east_m, y - north_m) for east_m, north_m in way_m]
+    items = (
+        Item(Do.TAKE_OFF, height_m=AGL_M),
+        *(Item(Do.WAYPOINT, i + 1, *corner, height_m=AGL_M) for i, corner in enumerate(corners)),
+        Item(Do.LAND, len(corners) + 1, *corners[-1], height_m=0.0),
+    )
+    return Mission(name, *place.wgs84(x, y), items)
+
+
+def _states(flight: Flight) -> list[tuple[float, PeerState]]:
+    rows = []
+    for t_s in np.arange(0.0, flight.path.duration_s, STEP_S).tolist():
+        state = peer_state_of(flight.path.state(t_s), flight.frame)
+        rows.append((t_s, replace(state, airspeed_mps=math.nan)))  # it has no sensor of airspeed
+    return rows
+
+
+def phases(course: Course, duration_s: float) -> dict[Phase, float]:
+    """Times of the faults of a flight from ground to ground."""
+    times = np.arange(0.0, duration_s, STEP_S)
+    states = [course(t_s) for t_s in times.tolist()]
+    agl_m = np.array([state.agl_m for state in states])
+    turn_radps = np.abs(np.gradient(np.unwrap([state.yaw_rad for state in states]), STEP_S))
+    high = agl_m > CRUISE_SHARE * agl_m.max()
+    landing_s = float(times[np.flatnonzero(high)[-1]])
+    usable = high & (times >= times[np.flatnonzero(high)[0]] + LEAD_S) & (times < landing_s - LEAD_S)
+    cruise_s = middle_of_longest(times, usable & (turn_radps < STRAIGHT_RADPS))
+    turn_s = float(times[np.argmax(np.where(usable, turn_radps, -1.0))])
+    return {
+        Phase.START: cruise_s,
+        Phase.CRUISE: cruise_s,
+        Phase.TURN: turn_s,
+        Phase.DARK: cruise_s,
+        Phase.LANDING: landing_s,
+    }
+
+
+def middle_of_longest(times: np.ndarray, chosen: np.ndarray) -> float:
+    """The time in the middle of the longest run of ``chosen`` (bool, as long as ``times``)."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], chosen.astype(np.int8), [0]))))
+    runs = edges.reshape(-1, 2)
+    first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]
+    return float(times[(first + last - 1) // 2])

@@ -1,0 +1,233 @@
+"""Parsers of what comes from outside, as functions of bytes. Any input may be refused (TerrafixError, or a result that
+says so); any other exception is a bug."""
+
+import io
+import tempfile
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from terrafix.core.config import Config, LinkSection
+from terrafix.core.config import load as load_config
+from terrafix.core.errors import TerrafixError
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.installed_files import installed_files
+from terrafix.core.mavlink.tlog import read_imu, read_tlog, record
+from terrafix.link.edge import MavlinkEdge
+from terrafix.link.node import LinkNode
+from terrafix.map.package import MapPackage
+from terrafix.messages import Camera, Frame, Message, Origin, StatusText
+from terrafix.recorder.provenance import header
+from terrafix.recorder.reader import ReadResult, read_received
+from terrafix.recorder.writer import FlightWriter
+from terrafix.vision.sources import parse_start
+from terrafix.vision.sources.description import read_description
+from terrafix.vision.sources.exif import read_info
+from terrafix.vision.sources.images import decode_image
+from terrafix.vision.sources.mjpeg import MjpegCapture
+from terrafix.vision.sources.table import read_table
+from terrafix_lab.sim.autopilot.fuzz_wire import UNIX_NS, Autopilot
+from terrafix_lab.sim.autopilot.wire import heartbeat
+from terrafix_lab.sim.closed_loop.loopback import Loopback
+from terrafix_tools.autopilot_log.read import read_autopilot_log
+from terrafix_tools.mission.file import read_mission
+
+WIDTH, HEIGHT = 64, 48  # of the images
+SIDE_PX = 300  # of the map
+STEPS = 40  # of the telemetry, 0.02 s each
+
+
+@dataclass(frozen=True)
+class Target:
+    """``seeds``: valid inputs; ``run`` raises only TerrafixError."""
+
+    name: str
+    seeds: Callable[[], list[bytes]]
+    run: Callable[[bytes], None]
+
+
+def _in_file(suffix: str, read: Callable[[Path], object]) -> Callable[[bytes], None]:
+    """Runs a reader of files; the file is in memory."""
+    folder = Path(tempfile.mkdtemp(prefix="terrafix-fuzz-", dir="/dev/shm"))
+    path = folder / f"input{suffix}"
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        read(path)
+
+    return run
+
+
+def _images() -> list[bytes]:
+    image = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    return [cv2.imencode(suffix, image)[1].tobytes() for suffix in (".jpg", ".png", ".webp", ".tiff", ".bmp")]
+
+
+def _configs() -> list[bytes]:
+    return [(installed_files() / "config" / "default.toml").read_bytes(), b'[link]\ndevice = "udpin:0.0.0.0:14550"\n']
+
+
+def _descriptions() -> list[bytes]:
+    cameras = installed_files() / "config" / "cameras"
+    start = b"\n[start]\nlat_deg = 48.0\nlon_deg = 11.0\nsigma_m = 10.0\n"
+    return [path.read_bytes() + start for path in sorted(cameras.glob("*.toml"))]
+
+
+def _tables() -> list[bytes]:
+    rows = "".join(f"{i:04d}.jpg,{0.5 * i},90,0,-1.5,100\n" for i in range(8))
+    return [f"file,t_s,yaw_deg,pitch_deg,roll_deg,agl_m\n{rows}".encode(), b"file,t_s\na.jpg,0\nb.jpg,1\n"]
+
+
+@cache
+def _telemetry() -> tuple[list[bytes], list[bytes]]:
+    """Packets of a short flight: as they arrive, and as a log."""
+    autopilot = Autopilot(signed=False)
+    packets = [packet for step in range(STEPS) for packet in autopilot.packets(step, step * 20_000_000, b"")]
+    log = b"".join(record(1_700_000_000_000_000 + 20_000 * i, packet) for i, packet in enumerate(packets))
+    return [b"".join(packets), heartbeat(42)], [log]
+
+
+@cache
+def _records() -> list[bytes]:
+    """A small flight record."""
+    camera = Camera(width=WIDTH, height=HEIGHT, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
+    origin = Origin(
+        t_ns=1, camera=camera, lat_deg=48.0, lon_deg=11.0, ground_amsl_m=500.0, start_sigma_m=10.0, yaw_sigma_deg=3.0,
+        agl_sigma_m=3.0, attitude_sigma_deg=1.0,
+    )  # fmt: skip
+    frames = [Frame(t_ns=i, frame_id=i, file="", width=WIDTH, height=HEIGHT) for i in range(30)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "flight.mcap"
+        writer = FlightWriter(path, header(Config()))
+        for message in (origin, *frames, StatusText(t_ns=40, severity=4, text="no map fix")):
+            writer.write(message, message.t_ns)
+        writer.close()
+        return [path.read_bytes()]
+
+
+@cache
+def _maps() -> list[bytes]:
+    """A small map package; needs GDAL."""
+    import rasterio
+    from rasterio.transform import Affine
+
+    from terrafix_tools.mapping.build import build
+
+    bands = np.random.default_rng(2).integers(1, 255, (3, SIDE_PX, SIDE_PX), np.uint8)
+    with tempfile.TemporaryDirectory() as folder:
+        tif, package = Path(folder) / "map.tif", Path(folder) / "map.gpkg"
+        profile = {"driver": "GTiff", "width": SIDE_PX, "height": SIDE_PX, "count": 3, "dtype": "uint8"}
+        transform = Affine(1.0, 0.0, 690_000.0, 0.0, -1.0, 5_330_000.0)
+        with rasterio.open(tif, "w", **profile, crs="EPSG:32632", transform=transform) as file:
+            file.write(bands)
+        build(tif, package, date="2024-01-01")
+        return [package.read_bytes()]
+
+
+def _read_map(path: Path) -> None:
+    package = MapPackage.open(path)
+    try:
+        west, south, east, north = package.manifest.bounds_wgs84
+        frame = LocalFrame(0.5 * (south + north), 0.5 * (west + east))
+        local = package.bind(frame)
+        local.window(-50.0, 50.0, 100, 100, 1.0)
+        local.elevation(np.zeros(1), np.zeros(1))
+        package.verify()
+    finally:
+        package.close()
+
+
+def _read_record(path: Path) -> None:
+    for _ in read_received(path, ReadResult()):
+        pass
+
+
+def _read_log(path: Path) -> None:
+    read_tlog(path)
+    read_imu(path)
+
+
+def _receive(data: bytes) -> None:
+    """MAVLink bytes through the edge and the node of the link."""
+    loopback, node = Loopback(), LinkNode(10.0)
+    edge = MavlinkEdge(LinkSection(), loopback, lambda: UNIX_NS)
+    for start in range(0, len(data), 512):
+        loopback.to_companion(data[start : start + 512])
+        now_ns = 20_000_000 * (1 + start // 512)
+        for message in (*_fed(node, edge.poll(now_ns)), *node.tick(now_ns)):
+            edge.on_message(message)
+
+
+def _fed(node: LinkNode, messages: Iterable[Message]) -> Iterable[Message]:
+    for message in messages:
+        yield message
+        yield from node.on(message)
+
+
+class _Response(io.BytesIO):
+    """What http.client gives for the body of a stream."""
+
+
+def _stream(data: bytes) -> None:
+    capture = MjpegCapture.__new__(MjpegCapture)
+    capture.stamp_ns, capture._jpeg, capture._at_part = None, b"", False
+    capture._response, capture._boundary = _Response(data), b"--frame"  # type: ignore[assignment]
+    while capture.grab():
+        capture.retrieve()
+
+
+def _streams() -> list[bytes]:
+    jpeg = _images()[0]
+    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\nX-Timestamp-Ns: 12\r\n\r\n".encode()
+    return [(head + jpeg + b"\r\n") * 3, (b"--frame\r\n\r\n" + jpeg + b"\r\n") * 3]
+
+
+def _missions() -> list[bytes]:
+    lines = [
+        "QGC WPL 110",
+        "0\t1\t0\t16\t0\t0\t0\t0\t48.0\t11.0\t500\t1",
+        "1\t0\t3\t22\t0\t0\t0\t0\t0\t0\t60\t1",
+        "2\t0\t3\t16\t0\t0\t0\t0\t48.001\t11.0\t60\t1",
+        "3\t0\t3\t21\t0\t0\t0\t0\t48.001\t11.0\t0\t1",
+    ]
+    item = '{"type":"SimpleItem","command":16,"frame":3,"params":[0,0,0,0,48.0,11.0,60]}'
+    plan = f'{{"fileType":"Plan","mission":{{"plannedHomePosition":[48.0,11.0,500],"items":[{item}]}}}}'
+    return ["\n".join(lines).encode(), plan.encode()]
+
+
+def _start(data: bytes) -> None:
+    parse_start(data.decode("utf-8", "replace"))
+
+
+def _image(data: bytes) -> None:
+    for by in (1, 2):
+        decode_image(data, WIDTH, HEIGHT, by)
+
+
+TARGETS: tuple[Target, ...] = (
+    Target("mavlink", lambda: _telemetry()[0], _receive),
+    Target("telemetry log", lambda: _telemetry()[1], _in_file(".tlog", _read_log)),
+    Target("configuration", _configs, _in_file(".toml", lambda path: load_config([path]))),
+    Target("description", _descriptions, _in_file(".toml", read_description)),
+    Target("frames.csv", _tables, _in_file(".csv", lambda path: read_table(path, "frames.csv", with_file=True))),
+    Target("image", _images, _image),
+    Target("photo", _images, _in_file(".jpg", read_info)),
+    Target("stream", _streams, _stream),
+    Target("record", _records, _in_file(".mcap", _read_record)),
+    Target("map", _maps, _in_file(".gpkg", _read_map)),
+    Target("mission", _missions, _in_file(".waypoints", read_mission)),
+    Target("plan", _missions, _in_file(".plan", read_mission)),
+    Target("autopilot log", lambda: _telemetry()[1], _in_file(".tlog", read_autopilot_log)),
+    Target("start", lambda: [b"48.1,11.2"], _start),
+)
+
+
+def refused_or_read(target: Target, data: bytes) -> None:
+    """Runs a target. Raises what is a bug."""
+    with suppress(TerrafixError):
+        target.run(data)

@@ -1,0 +1,211 @@
+"""One flight of the run: messages into the real EstimatorNode, in the order of the in-process executor."""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from terrafix.core.camera import CameraCalibration
+from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.pose import log_so3
+from terrafix.estimator.node import EstimatorNode
+from terrafix.messages import (
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Origin,
+    Prediction,
+    Refinement,
+    SourceEnded,
+    Verdict,
+)
+from terrafix.smoother.node import SmootherNode
+from terrafix_lab.montecarlo.faults import Faults
+from terrafix_lab.montecarlo.flown import Shot, fly
+from terrafix_lab.montecarlo.ground import MapError, Terrain
+from terrafix_lab.montecarlo.lens import Lens
+from terrafix_lab.montecarlo.lies import FindMatch, Lies
+from terrafix_lab.montecarlo.matches import MapMatches
+from terrafix_lab.montecarlo.plan import FlightPlan
+from terrafix_lab.montecarlo.sightings import SimulatedOdometry
+
+
+@dataclass
+class Record:
+    """Result of a flight. Arrays have one row for each frame, of its last estimate."""
+
+    plan: FlightPlan
+    t_s: np.ndarray
+    path_m: np.ndarray  # (N,) flown over ground
+    truth_m: np.ndarray  # (N, 2)
+    error_m: np.ndarray  # (N, 6): east, north, up [m], rotation about them [rad]; estimate minus truth
+    cov: np.ndarray  # (N, 6, 6) as published
+    velocity_error_mps: np.ndarray  # (N, 3)
+    velocity_sigma_mps: np.ndarray  # (N,)
+    anchor_age_ms: np.ndarray  # (N,)
+    refined_error_m: np.ndarray  # (N, 2); nan: not refined
+    refined_sigma_m: np.ndarray  # (N, 2)
+    cpu_ms: np.ndarray  # (N,) of the estimator
+    memory_mb: np.ndarray  # (N,) of this process
+    refine_cpu_s: float = 0.0
+    rebuilds: int = 0
+    restarts: int = 0
+    smoother_cpu_s: float = 0.0
+    smoothed_error_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2); nan: not refined in flight
+    smoothed_cov: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))  # (N, 2, 2) as published
+    lie_from_s: float | None = None  # start of the first false input; None: there is none
+    fixes: dict[str, int] = field(default_factory=dict)  # verdicts on map matches
+
+
+def run(plan: FlightPlan, *, refine: bool = True) -> Record:
+    """Deterministic except for processor time and memory."""
+    return Run(plan).record(refine)
+
+
+class Run:
+    def __init__(self, plan: FlightPlan) -> None:
+        flown = fly(plan, Terrain(plan.seed, plan.hills_m, plan.settled))
+        self._plan, self._flown = plan, flown
+        self._node, self._smoother = EstimatorNode(), SmootherNode()
+        self._frame = LocalFrame(flown.origin.lat_deg, flown.origin.lon_deg)
+        self._times_ns: dict[int, int] = {}  # frame -> time of its newest estimate
+        self._page_mb = os.sysconf("SC_PAGE_SIZE") / 2**20
+        n = len(flown.frames)
+        self._record = Record(
+            plan=plan,
+            t_s=np.array([shot.t_s for shot in flown.frames]),
+            path_m=flown.path_m,
+            truth_m=np.array([shot.p_m[:2] for shot in flown.frames]),
+            error_m=np.full((n, 6), np.nan),
+            cov=np.full((n, 6, 6), np.nan),
+            velocity_error_mps=np.full((n, 3), np.nan),
+            velocity_sigma_mps=np.full(n, np.nan),
+            anchor_age_ms=np.full(n, -1),
+            refined_error_m=np.full((n, 2), np.nan),
+            refined_sigma_m=np.full((n, 2), np.nan),
+            cpu_ms=np.zeros(n),
+            memory_mb=np.full(n, np.nan),
+            smoothed_error_m=np.full((n, 2), np.nan),
+            smoothed_cov=np.full((n, 2, 2), np.nan),
+        )
+
+    def record(self, refine: bool) -> Record:
+        plan, flown, record = self._plan, self._flown, self._record
+        lens = Lens(CameraCalibration.of(plan.camera), plan.focal_error, plan.k1_error)
+        sightings = SimulatedOdometry(lens, flown.terrain, plan.seed)
+        matches = MapMatches(
+            lens,
+            flown.terrain,
+            MapError(plan.seed, np.array(plan.map_offset_m), plan.map_sigma_m),
+            has_dem=plan.has_dem,
+            map_sigma_m=plan.map_sigma_m,
+            seed=plan.seed,
+        )
+        faults, lies = Faults(plan.fault, plan.duration_s, plan.seed), Lies(plan, flown)
+        record.lie_from_s = lies.start_s()
+        self._send(flown.origin)
+        late: list[tuple[int, MapMatch]] = []  # frame at which it is published
+        for i, shot in enumerate(flown.frames):
+            odometry = sightings.odometry(i, lies.picture(i), blind=faults.is_blacked_out(shot.t_s))
+            with self._stopwatch(record.cpu_ms, i):
+                for state in flown.telemetry[i]:
+                    self._send(state)
+                published = self._send(odometry)
+            find = find_match(matches, faults, shot.t_s)
+            late += [
+                (i + faults.late_frames(), faults.alter(lies.match(i, prediction, find), shot))
+                for prediction in published
+                if isinstance(prediction, Prediction)
+            ]
+            with self._stopwatch(record.cpu_ms, i):
+                for due, match in late:
+                    if due <= i:
+                        self._send(match)
+            late = [(due, match) for due, match in late if due > i]
+            record.memory_mb[i] = self._page_mb * int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        if refine:
+            refine_ms = np.zeros(1)
+            with self._stopwatch(refine_ms, 0):
+                self._send(SourceEnded(t_ns=round(flown.frames[-1].t_s * 1e9), frames=len(flown.frames)))
+            record.refine_cpu_s = 1e-3 * float(refine_ms[0])
+        estimator = self._node.estimator  # no message has this number
+        record.rebuilds = estimator.graph.rebuilds if estimator is not None else 0
+        return record
+
+    @contextmanager
+    def _stopwatch(self, into_ms: np.ndarray, i: int) -> Iterator[None]:
+        """Adds the processor time of the block to ``into_ms[i]``."""
+        start_s = time.process_time()
+        yield
+        into_ms[i] += 1e3 * (time.process_time() - start_s)
+
+    def process(self, message: Message) -> list[Message]:
+        """-> the messages that the estimator publishes."""
+        return list(self._node.on(message))
+
+    def _send(self, message: Message) -> list[Message]:
+        """Processes ``message`` and records what is published, which is returned."""
+        published = self.process(message)
+        for given in (message, *published) if isinstance(message, Origin) else published:
+            self._record_smoothed(given)
+        for answer in published:
+            match answer:
+                case NavEstimate():
+                    self._record_estimate(answer)
+                case MeasurementVerdict(measurement="map"):
+                    fixes = self._record.fixes
+                    fixes[str(answer.verdict)] = fixes.get(str(answer.verdict), 0) + 1
+                    restarted = answer.verdict is Verdict.ACCEPTED and answer.detail.startswith("restarted")
+                    self._record.restarts += restarted
+                case Refinement():
+                    for pose in answer.poses:
+                        at = self._frame.to_local(pose.lat_deg, pose.lon_deg)
+                        truth_m = self._truth(pose.frame_id).p_m[:2]
+                        self._record.refined_error_m[pose.frame_id] = np.array(at) - truth_m
+                        self._record.refined_sigma_m[pose.frame_id] = pose.sigma_e_m, pose.sigma_n_m
+        return published
+
+    def _record_smoothed(self, message: Message) -> None:
+        """What the smoother refines after ``message``. Its time is not the estimator's."""
+        began_s, record = time.process_time(), self._record
+        for answer in self._smoother.on(message):
+            if isinstance(answer, Refinement):
+                for pose in answer.poses:
+                    at = self._frame.to_local(pose.lat_deg, pose.lon_deg)
+                    record.smoothed_error_m[pose.frame_id] = np.array(at) - self._truth(pose.frame_id).p_m[:2]
+                    (e2, n2), en = np.square([pose.sigma_e_m, pose.sigma_n_m]), pose.cov_en_m2
+                    record.smoothed_cov[pose.frame_id] = [[e2, en], [en, n2]]
+        record.smoother_cpu_s += time.process_time() - began_s
+
+    def _truth(self, frame_id: int) -> Shot:
+        """At the time of the newest estimate of the frame. That is earlier than the frame's time stamp if the estimator
+        corrects a time offset of the camera."""
+        shot, t_ns = self._flown.frames[frame_id], self._times_ns[frame_id]
+        return shot if round(shot.t_s * 1e9) == t_ns else self._flown.at(t_ns * 1e-9)
+
+    def _record_estimate(self, estimate: NavEstimate) -> None:
+        i, record = estimate.frame_id, self._record
+        self._times_ns[i] = estimate.t_ns
+        shot = self._truth(i)
+        e_m, n_m = self._frame.to_local(estimate.lat_deg, estimate.lon_deg)
+        record.error_m[i, :3] = np.array([e_m, n_m, estimate.alt_amsl_m]) - shot.p_m
+        record.error_m[i, 3:] = log_so3(rot_from_quat(estimate.q_w_b) @ shot.r_w_b.T)
+        record.cov[i] = np.array(estimate.cov).reshape(6, 6)
+        record.velocity_error_mps[i] = np.array(estimate.velocity_enu_mps) - shot.velocity_mps
+        record.velocity_sigma_mps[i] = estimate.velocity_sigma_mps
+        record.anchor_age_ms[i] = estimate.last_anchor_age_ms
+
+
+def find_match(matches: MapMatches, faults: Faults, t_s: float) -> FindMatch:
+    """The matches at ``t_s``: none in a blackout, or over ground that the map does not have."""
+    if faults.is_blacked_out(t_s):
+        return partial(matches.no_match, verdict=Verdict.BAD_IMAGE)
+    if faults.is_unmapped(t_s):
+        return partial(matches.no_match, verdict=Verdict.FEW_INLIERS)
+    return matches.match

@@ -1,0 +1,185 @@
+"""The true trajectory of a flight, and the telemetry of its autopilot.
+
+World: east, north, up AMSL [m] around the start coordinate of the pilot, which is the estimator's local frame. The
+earth is flat here as in the estimator; geodesy is not tested."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from terrafix.core.camera import Mount
+from terrafix.core.geodesy import LocalFrame
+from terrafix.core.pose import exp_so3, log_so3
+from terrafix.messages import Imu, Message, Origin, VehicleState
+from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.montecarlo.ground import Terrain
+from terrafix_lab.montecarlo.plan import FlightPlan
+from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.camera.mount import Fixed, Gimbal
+from terrafix_lab.sim.interfaces import Readings, State
+from terrafix_lab.sim.sensors.errors import SensorErrors
+from terrafix_lab.sim.sensors.suite import VehicleSensors
+from terrafix_lab.sim.vehicle.copter import Copter, CopterLimits
+from terrafix_lab.sim.vehicle.plane import Plane, PlaneLimits
+from terrafix_tools.mission.course import course
+from terrafix_tools.mission.items import Box, Mission
+
+LAT_DEG, LON_DEG = 48.0, 11.0  # any place: only the estimator's conversions to and from the local frame use it
+STEP_S = 0.02
+HALF_BOX_M = 1500.0
+SPARE = 1.2  # length of the course over what is flown of it
+CLIMBS = 0.25  # 1-sigma of a waypoint's height, as a share of the flight's
+MIN_AGL_M = 60.0
+TELEMETRY_EVERY, SLOW_EVERY = 2, 5  # steps: attitude at 25 Hz with inertial readings, 10 Hz without
+IMU_BATCH = 5  # readings in a message, at 50 Hz
+YAW_SIGMA_DEG, AGL_SIGMA_M, ATTITUDE_SIGMA_DEG = 3.0, 3.0, 0.7  # as `terrafix sim make` states them
+
+
+@dataclass(frozen=True)
+class Shot:
+    """True pose and velocity of one frame."""
+
+    t_s: float
+    p_m: np.ndarray  # (3,) of the camera, which is at the origin of the body
+    r_w_c: np.ndarray  # (3, 3)
+    r_w_b: np.ndarray  # (3, 3) of the body, or of the stabilised frame of a gimbal
+    velocity_mps: np.ndarray  # (3,)
+
+
+@dataclass(frozen=True)
+class SimulatedFlight:
+    origin: Origin
+    frames: list[Shot]
+    pictures: list[Shot]  # content of each frame: the truth at its exposure, with the stated time
+    telemetry: list[list[Message]]  # before each frame
+    path_m: np.ndarray  # (N,) flown over ground up to each frame
+    terrain: Terrain  # in the estimator's local frame
+
+    def at(self, t_s: float) -> Shot:
+        """The truth at any time of the flight. Between frames: cubic Hermite position, constant angular rate."""
+        times_s = [shot.t_s for shot in self.frames]
+        i = int(np.clip(np.searchsorted(times_s, t_s, side="right") - 1, 0, len(times_s) - 2))
+        a, b = self.frames[i], self.frames[i + 1]
+        dt_s = b.t_s - a.t_s
+        u = (t_s - a.t_s) / dt_s
+        p_m = (
+            (2 * u**3 - 3 * u**2 + 1) * a.p_m
+            + (u**3 - 2 * u**2 + u) * dt_s * a.velocity_mps
+            + (3 * u**2 - 2 * u**3) * b.p_m
+            + (u**3 - u**2) * dt_s * b.velocity_mps
+        )
+        turned = [ra @ exp_so3(u * log_so3(ra.T @ rb)) for ra, rb in ((a.r_w_c, b.r_w_c), (a.r_w_b, b.r_w_b))]
+        return Shot(t_s, p_m, turned[0], turned[1], (1 - u) * a.velocity_mps + u * b.velocity_mps)
+
+
+def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
+    """Flies ``plan``. ``terrain``: in the frame of the mission."""
+    frame = LocalFrame(LAT_DEG, LON_DEG)
+    vehicle = _vehicle(plan, terrain, frame)
+    errors = SensorErrors(yaw_constant_rad=plan.compass_rad)
+    sensors = VehicleSensors(frame, seed=plan.seed, errors=errors, airspeed=plan.kind is Kind.PLANE)
+    hanging = Gimbal(seed=plan.seed) if plan.gimbal else Fixed()
+    r_b_c = Mount.of(plan.camera).r_b_c()
+    tilt = exp_so3(np.array([*plan.mount_error_rad, 0.0]))
+    first = vehicle.state
+    claimed = first.p_b_in_w_m[:2] + np.array(plan.start_error_m)
+    home_m = terrain.bare_at_m(float(claimed[0]), float(claimed[1]))
+    every = TELEMETRY_EVERY if plan.has_imu else SLOW_EVERY
+    frame_every = round(1.0 / (plan.frame_hz * STEP_S))
+    lag = round(plan.picture_lag_s / STEP_S)
+    frames: list[Shot] = []
+    pictures: list[Shot] = []
+    taken: Shot | None = None  # the picture that is delivered next, when pictures are late
+    telemetry: list[list[Message]] = []
+    waiting: list[Message] = []
+    batch: list[Readings] = []
+    path_m, paths_m = 0.0, []
+    state = first
+
+    def shot(at: State) -> Shot:
+        held = hanging.r_w_c(at)
+        p_m = at.p_b_in_w_m - np.array([*claimed, 0.0])
+        return Shot(at.t_s, p_m, held @ tilt, held @ r_b_c.T, at.velocity_enu_mps)
+
+    for i in range(math.floor(plan.duration_s / STEP_S)):
+        if i:
+            state = vehicle.step(STEP_S, None)
+            path_m += float(np.hypot(*state.velocity_enu_mps[:2])) * STEP_S
+        if plan.has_imu or i % every == 0:
+            readings = sensors.read(state)
+            if i % every == 0:
+                waiting.append(_vehicle_state(plan, readings, home_m))
+            if plan.has_imu:
+                batch.append(readings)
+        if len(batch) == IMU_BATCH:
+            waiting.append(imu_of(batch, "montecarlo"))
+            batch = []
+        if i % frame_every == 0:
+            frames.append(shot(state))
+            pictures.append(replace(taken or frames[-1], t_s=state.t_s))
+            telemetry.append(waiting[-1:] if plan.fault is Fault.PHOTOS else waiting)
+            waiting = []
+            paths_m.append(path_m)
+        if lag and (i + lag) % frame_every == 0:
+            taken = shot(state)
+    return SimulatedFlight(
+        _origin(plan, home_m), frames, pictures, telemetry, np.array(paths_m), terrain.seen_from(claimed)
+    )
+
+
+def _vehicle(plan: FlightPlan, terrain: Terrain, frame: LocalFrame) -> Plane | Copter:
+    mission, height = _mission(plan, frame), terrain.bare_at_m
+    if plan.kind is Kind.PLANE:
+        quick = PlaneLimits(cruise_mps=plan.cruise_mps)
+        return Plane(mission, frame, height, wind=plan.wind, seed=plan.seed, limits=quick)
+    slow = CopterLimits(cruise_mps=plan.cruise_mps)
+    return Copter(mission, frame, height, wind=plan.wind, seed=plan.seed, limits=slow)
+
+
+def _mission(plan: FlightPlan, frame: LocalFrame) -> Mission:
+    """A closed course with another height at every waypoint."""
+    box = Box(-HALF_BOX_M, -HALF_BOX_M, HALF_BOX_M, HALF_BOX_M)
+    length_m = SPARE * (plan.cruise_mps + plan.wind.speed_mps()) * plan.duration_s
+    drawn = course(plan.seed, length_m, box, frame, agl_m=plan.agl_m)
+    heights = np.random.default_rng([plan.seed, 54]).normal(1.0, CLIMBS, len(drawn.items))
+    items = [
+        replace(item, height_m=max(MIN_AGL_M, plan.agl_m * float(share)))
+        for item, share in zip(drawn.items, heights, strict=True)
+    ]
+    return replace(drawn, items=tuple(items))
+
+
+def _vehicle_state(plan: FlightPlan, readings: Readings, home_m: float) -> VehicleState:
+    """As the link publishes it. With a gimbal the roll and pitch of the camera are not reported."""
+    return VehicleState(
+        t_ns=round(readings.t_s * 1e9),
+        source="montecarlo",
+        yaw_rad=readings.yaw_rad,
+        pitch_rad=None if plan.gimbal else readings.pitch_rad,
+        roll_rad=None if plan.gimbal else readings.roll_rad,
+        agl_m=plan.height_scale * (readings.baro_amsl_m - home_m),
+        armed=True,
+        airspeed_mps=readings.airspeed_mps,
+    )
+
+
+def imu_of(batch: list[Readings], source: str) -> Imu:
+    """The inertial readings of a batch as one message, at the time of the last."""
+    newest_ns = round(batch[-1].t_s * 1e9)
+    samples = [(newest_ns - round(r.t_s * 1e9), *r.accel_b_mps2.tolist(), *r.gyro_b_radps.tolist()) for r in batch]
+    return Imu(t_ns=newest_ns, source=source, samples=samples)
+
+
+def _origin(plan: FlightPlan, home_m: float) -> Origin:
+    return Origin(
+        t_ns=0,
+        camera=plan.camera,
+        lat_deg=LAT_DEG,
+        lon_deg=LON_DEG,
+        ground_amsl_m=home_m,
+        start_sigma_m=plan.start_sigma_m,
+        yaw_sigma_deg=YAW_SIGMA_DEG,
+        agl_sigma_m=AGL_SIGMA_M,
+        attitude_sigma_deg=ATTITUDE_SIGMA_DEG,
+    )

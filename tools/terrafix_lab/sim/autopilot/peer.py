@@ -1,0 +1,192 @@
+"""The simulated autopilot in real time on a local UDP port, along a given course, for tests with the real processes.
+
+``AutopilotPeer`` runs in a thread; process.py runs it in its own process. GPS_INPUT changes its navigation solution,
+not the course of the vehicle; in the closed loop (sim/closed_loop) an error moves the vehicle.
+"""
+
+import contextlib
+import math
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from terrafix.core.errors import LinkError
+from terrafix.core.geodesy import LocalFrame
+from terrafix_lab.sim.autopilot.course import Course, CourseFollower
+from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
+from terrafix_lab.sim.autopilot.parameters import GPS_INPUT_ALONE, NO_DCM, Kind
+from terrafix_lab.sim.autopilot.report import PeerMonitor, PeerReport, ReceivedFix
+from terrafix_lab.sim.interfaces import Navigation, navigation_of
+from terrafix_lab.sim.sensors.clock import Clock
+from terrafix_lab.sim.sensors.suite import VehicleSensors
+
+STEP_S = 0.02
+DATAGRAM_MAX = 4096
+
+
+class AutopilotPeer:
+    """Interface: ``start``, then ``stop`` for the report. ``aligned``: starts in the air with a known position, after
+    the loss of real GPS.
+    """
+
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        aligned: bool = True,
+        sysid: int = 1,
+        kind: Kind = Kind.PLANE,
+        parameters: dict[str, float] | None = None,
+        home_amsl_m: float | None = None,
+    ) -> None:
+        """Raises UsageError for an unknown parameter."""
+        self._parameters = GPS_INPUT_ALONE | NO_DCM | (parameters or {})
+        self._seed, self._aligned, self._sysid, self._home_amsl_m = seed, aligned, sysid, home_amsl_m
+        self._kind = kind
+        self._companion: tuple[str, int] | None = None
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._landed = False
+        self._reboots = False
+        self.muted = False  # receives and sends nothing, as with the cable unplugged
+        self.received_s: list[float] = []  # monotonic time of each GPS_INPUT
+
+    def start(
+        self, port: int, course: Course, clock: Callable[[], float] | None = None, *, to: int | None = None
+    ) -> int:
+        """Listens on 127.0.0.1:``port`` (0: any) and replies to the sender, or sends first to port ``to``.
+
+        ``clock`` gives the seconds of the flight; by default they run from now. Returns the port. Raises LinkError.
+        """
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(("127.0.0.1", port))
+        except OSError as error:
+            self._socket.close()
+            raise LinkError(f"autopilot peer: port {port} cannot be used ({error.strerror}); choose another") from None
+        self._socket.setblocking(False)
+        self._companion = None if to is None else ("127.0.0.1", to)
+        self._started_s = time.monotonic()
+        self._clock = clock or self._now_s
+        self._create_autopilot(course)
+        self._thread = threading.Thread(target=self._fly, name="autopilot-peer", daemon=True)
+        self._thread.start()
+        return int(self._socket.getsockname()[1])
+
+    def stop(self) -> PeerReport:
+        """Ends the flight and returns the report. Stop the peer before the link, otherwise the missing GPS_INPUT at
+        the end counts.
+        """
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._socket.close()
+            self._thread = None
+        if not self._landed:
+            raise RuntimeError("the autopilot peer's thread has died; its traceback is above")
+        return self._monitor.report()
+
+    def latest(self) -> tuple[int, float | None]:
+        """Returns the fix type of GPS_INPUT and the current position error (m), for a progress line; callable from any
+        thread.
+        """
+        gps, errors = self._autopilot.gps[self._autopilot.used_gps], self._monitor.errors_m
+        return gps.fix_type if gps is not None else 0, errors[-1] if errors else None
+
+    def fixes(self) -> list[ReceivedFix]:
+        """The 3D fixes of GPS_INPUT so far, ``received_s`` on the monotonic clock; callable from any thread."""
+        return [replace(fix, received_s=fix.received_s + self._started_s) for fix in list(self._monitor.fixes)]
+
+    def inject(self, data: bytes) -> None:
+        """Sends bytes of another origin on the same line; callable from any thread."""
+        if self._companion is not None:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, self._companion)
+
+    def reboot(self) -> None:
+        """The autopilot starts again in the air, without a position, and its clock begins at zero."""
+        self._reboots = True
+
+    def _now_s(self) -> float:
+        """Seconds since the start: the autopilot's time. The flight's may begin later."""
+        return time.monotonic() - self._started_s
+
+    def _create_autopilot(self, course: Course) -> None:
+        first = course(self._clock())
+        frame = LocalFrame(first.lat_deg, first.lon_deg)
+        self._course = CourseFollower(course, frame)
+        state = self._course.state(0.0, self._clock())
+        self._autopilot = self._new_autopilot(
+            frame,
+            start=navigation_of(state) if self._aligned else None,
+            home_amsl_m=first.amsl_m - first.agl_m if self._home_amsl_m is None else self._home_amsl_m,
+            boot_ns=Clock.of(self._seed).boot_ns,
+        )
+        self._sensors = VehicleSensors(frame, seed=self._seed, airspeed=not math.isnan(first.airspeed_mps))
+        self._monitor = PeerMonitor(self._autopilot, frame)
+
+    def _new_autopilot(
+        self, frame: LocalFrame, *, start: Navigation | None, home_amsl_m: float, boot_ns: Callable[[float], int]
+    ) -> SimAutopilot:
+        self._home_amsl_m = home_amsl_m
+        return SimAutopilot(
+            frame,
+            self._kind,
+            start=start,
+            home_amsl_m=home_amsl_m,
+            parameters=self._parameters,
+            sysid=self._sysid,
+            boot_ns=boot_ns,
+        )
+
+    def _restart(self) -> None:
+        boot_ns, booted_s, frame = Clock.of(self._seed).boot_ns, self._now_s(), self._monitor.frame
+        assert self._home_amsl_m is not None
+        self._autopilot = self._new_autopilot(
+            frame, start=None, home_amsl_m=self._home_amsl_m, boot_ns=lambda now_s: boot_ns(now_s - booted_s)
+        )
+        self._monitor.watch(self._autopilot)
+
+    def _fly(self) -> None:
+        step_at_s = STEP_S
+        while not self._stopping.is_set():
+            select.select([self._socket], [], [], max(0.0, step_at_s - self._now_s()))
+            if self._reboots:
+                self._reboots = False
+                self._restart()
+            self._receive()
+            now_s = self._now_s()
+            if now_s >= step_at_s:
+                step_at_s = max(step_at_s + STEP_S, now_s)
+                self._step(now_s)
+            self._send()
+        self._landed = True
+
+    def _step(self, now_s: float) -> None:
+        state = self._course.state(now_s, self._clock())
+        self._autopilot.step(now_s, self._sensors.read(state))
+        self._monitor.observe(now_s, state)
+
+    def _receive(self) -> None:
+        while True:
+            try:
+                packets, self._companion = self._socket.recvfrom(DATAGRAM_MAX)
+            except (BlockingIOError, ConnectionRefusedError):
+                return
+            if self.muted:
+                continue
+            before = self._autopilot.counts.received
+            self._autopilot.receive(packets, self._now_s())
+            self.received_s += [time.monotonic()] * (self._autopilot.counts.received - before)
+
+    def _send(self) -> None:
+        packets = self._autopilot.transmit()
+        if not packets or self._companion is None or self.muted:
+            return
+        try:
+            self._socket.sendto(packets, self._companion)
+        except OSError:  # no receiver, or no buffer space: a radio would lose the packet as well
+            return

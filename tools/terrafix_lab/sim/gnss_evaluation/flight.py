@@ -1,0 +1,189 @@
+"""One flight for the GNSS spoofing detector, as messages: a receiver with disturbances, and consistent estimates.
+
+The receiver is that of the simulated vehicles (sim/sensors/gnss.py). The estimate's error is the sum of a constant
+part (the map) and a Gauss-Markov part, together as large as its covariance states; in some flights it is dead reckoned
+for a while.
+"""
+
+import math
+import random
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from terrafix.core.geodesy import LocalFrame
+from terrafix.link.gnss.map_registration import MapOffsetEstimator
+from terrafix.link.node import LinkNode
+from terrafix.messages import (
+    CovarianceMode,
+    GnssReading,
+    GnssState,
+    GnssVerdict,
+    GpsInput,
+    NavEstimate,
+    SourceLabel,
+    VehicleState,
+)
+from terrafix_lab.sim.interfaces import GnssFix, State
+from terrafix_lab.sim.sensors.gnss import DELAY_S, Gnss
+from terrafix_lab.sim.sensors.gnss_events import AnyEvent
+
+STEP_S = 0.2  # period of receiver readings, attitude and the link's tick
+ESTIMATES_S = 0.4
+ESTIMATE_DELAY_S = 0.3
+NS_PER_S = 1_000_000_000
+GRAVITY_MPS2 = 9.81
+FRAME = LocalFrame(48.0, 11.0)
+ALT_M = 620.0
+
+
+@dataclass(frozen=True)
+class Vision:
+    """Quality of the estimate: 1-sigma per axis, and the composition of its error."""
+
+    sigma_m: float
+    constant_share: float = 0.5  # of the variance: constant error of the map over the flight
+    wander_s: float = 20.0  # correlation time of the rest
+    velocity_sigma_mps: float = 0.7
+    gap: tuple[float, float] = (0.0, 0.0)  # (from, to) in s, without map matches and odometry
+    gap_mps: float = 0.5  # 1-sigma per axis of the drift in the gap
+
+
+@dataclass
+class DetectorResult:
+    """The detector's states with their times in s, and the sent positions."""
+
+    states: list[tuple[float, GnssState]] = field(default_factory=list)
+    lost_fix_s: float | None = None  # time at which the receiver's own fix was lost
+    # Sent positions, once a second: time [s], error east and north [m], stated 1-sigma [m]
+    sent: list[tuple[float, float, float, float]] = field(default_factory=list)
+
+    def first(self, after_s: float, *wanted: GnssState) -> float | None:
+        return next((t for t, state in self.states if t >= after_s and state in wanted), None)
+
+
+def fly(
+    duration_s: float, vision: Vision, events: tuple[AnyEvent, ...], seed: int, *, map_offset: bool = True
+) -> DetectorResult:
+    """Simulates one flight. ``map_offset``: the map's offset is estimated from the receiver."""
+    rng = random.Random(f"{seed} judge")
+    gnss = Gnss(FRAME, seed=seed, events=events)
+    node = LinkNode(10.0, map_offsets=MapOffsetEstimator() if map_offset else None)
+    trajectory, estimator, result = _Trajectory(rng), _Estimator(vision, rng), DetectorResult()
+    pending: list[tuple[float, NavEstimate]] = []
+    previous_state: GnssState | None = None
+    event_start_s = min((event.start_s for event in events), default=math.inf)
+    for step in range(round(duration_s / STEP_S)):
+        t_s = step * STEP_S
+        state = trajectory.step(t_s)
+        fix = gnss.read(state)  # 0.2 s old, by the step; the detector assumes an age of 0.15 s
+        if fix is not None and fix.fix_type < 3 and result.lost_fix_s is None and t_s >= event_start_s:
+            result.lost_fix_s = t_s - DELAY_S
+        if step % round(ESTIMATES_S / STEP_S) == 0:
+            pending.append((t_s + ESTIMATE_DELAY_S, estimator.estimate(state)))
+        outputs = []
+        while pending and pending[0][0] <= t_s:
+            node.on(pending.pop(0)[1])
+        now_ns = round(t_s * NS_PER_S)
+        node.on(_attitude(state, now_ns))
+        if fix is not None:
+            outputs += list(node.on(_reading(fix, now_ns)))
+        outputs += list(node.tick(now_ns))
+        for message in outputs:
+            if isinstance(message, GnssVerdict) and message.state is not previous_state:
+                previous_state = message.state
+                result.states.append((t_s, message.state))
+            elif isinstance(message, GpsInput) and message.fix_type >= 3 and step % round(1.0 / STEP_S) == 0:
+                e, n = FRAME.to_local(message.lat_deg, message.lon_deg)
+                off = np.array([e, n]) - state.p_b_in_w_m[:2]
+                result.sent.append((t_s, float(off[0]), float(off[1]), message.horiz_accuracy_m))
+    return result
+
+
+class _Trajectory:
+    """Straight legs and turns at constant speed."""
+
+    def __init__(self, rng: random.Random) -> None:
+        self._rng = rng
+        self._speed = rng.uniform(12.0, 28.0)
+        self._yaw = rng.uniform(-math.pi, math.pi)
+        self._p = np.array([0.0, 0.0, ALT_M])
+        self._rate, self._until_s = 0.0, 0.0
+
+    def step(self, t_s: float) -> State:
+        if t_s >= self._until_s:
+            turning = self._rate == 0.0 and t_s > 0
+            self._rate = self._rng.choice((-1, 1)) * self._rng.uniform(0.05, 0.25) if turning else 0.0
+            self._until_s = t_s + (self._rng.uniform(4.0, 14.0) if turning else self._rng.uniform(20.0, 120.0))
+        v = self._speed * np.array([math.sin(self._yaw), math.cos(self._yaw), 0.0])
+        roll = math.atan2(self._speed * self._rate, GRAVITY_MPS2)
+        zero = np.zeros(3)
+        state = State(t_s, self._p.copy(), v, self._yaw, 0.0, roll, 120.0, zero, zero, self._speed)
+        self._p += v * STEP_S
+        self._yaw = math.remainder(self._yaw + self._rate * STEP_S, math.tau)
+        return state
+
+
+class _Estimator:
+    def __init__(self, vision: Vision, rng: random.Random) -> None:
+        self._vision, self._gauss = vision, rng.gauss
+        constant_sigma = vision.sigma_m * math.sqrt(vision.constant_share)
+        self._constant = np.array([self._gauss(0.0, constant_sigma), self._gauss(0.0, constant_sigma)])
+        self._wander_sigma = vision.sigma_m * math.sqrt(1.0 - vision.constant_share)
+        self._wander = np.array([self._gauss(0.0, self._wander_sigma) for _ in range(2)])
+        self._velocity = np.zeros(2)
+        self._drift_mps = np.array([self._gauss(0.0, vision.gap_mps) for _ in range(2)])
+
+    def estimate(self, state: State) -> NavEstimate:
+        self._wander = self._walk(self._wander, self._wander_sigma, self._vision.wander_s)
+        self._velocity = self._walk(self._velocity, self._vision.velocity_sigma_mps, 2.0)
+        from_s, to_s = self._vision.gap
+        gap_s = state.t_s - from_s if from_s <= state.t_s < to_s else 0.0
+        e, n = state.p_b_in_w_m[:2] + self._constant + self._wander + self._drift_mps * gap_s
+        lat, lon = FRAME.to_wgs84(float(e), float(n))
+        t_ns = round(state.t_s * NS_PER_S)
+        cov = [0.0] * 36
+        cov[0] = cov[7] = self._vision.sigma_m**2 + (self._vision.gap_mps * gap_s) ** 2
+        cov[14] = 9.0
+        ve, vn = state.velocity_enu_mps[:2] + self._velocity
+        return NavEstimate(
+            t_ns=t_ns,
+            frame_id=t_ns,
+            lat_deg=lat,
+            lon_deg=lon,
+            alt_amsl_m=ALT_M,
+            agl_m=120.0,
+            velocity_enu_mps=(float(ve), float(vn), 0.0),
+            velocity_sigma_mps=self._vision.velocity_sigma_mps,
+            q_w_b=(1.0, 0.0, 0.0, 0.0),
+            cov=tuple(cov),
+            map_sigma_m=self._vision.sigma_m * math.sqrt(self._vision.constant_share),
+            source_label=SourceLabel.DEAD_RECKONED if gap_s else SourceLabel.SATELLITE_ANCHORED,
+            covariance_mode=CovarianceMode.MARGINALS,
+            last_anchor_age_ms=round(gap_s * 1000),
+            emitted_at_ns=t_ns + round(ESTIMATE_DELAY_S * NS_PER_S),
+        )
+
+    def _walk(self, value: np.ndarray, sigma: float, time_s: float) -> np.ndarray:
+        """Advances a Gauss-Markov process by one estimate interval."""
+        keep = math.exp(-ESTIMATES_S / time_s)
+        kick = sigma * math.sqrt(1.0 - keep * keep)
+        return keep * value + np.array([self._gauss(0.0, kick), self._gauss(0.0, kick)])
+
+
+def _attitude(state: State, now_ns: int) -> VehicleState:
+    return VehicleState(t_ns=now_ns, source="mavlink", yaw_rad=state.yaw_rad, pitch_rad=0.0, roll_rad=state.roll_rad)
+
+
+def _reading(fix: GnssFix, now_ns: int) -> GnssReading:
+    good = fix.fix_type >= 3
+    return GnssReading(
+        t_ns=now_ns,
+        receiver=0,
+        fix_type=fix.fix_type,
+        lat_deg=fix.lat_deg if good else None,
+        lon_deg=fix.lon_deg if good else None,
+        horizontal_m=fix.horizontal_m if good else None,
+        speed_mps=math.hypot(*fix.velocity_ned_mps[:2]) if good else None,
+        satellites=fix.satellites,
+    )
