@@ -139,6 +139,8 @@ class Frame(Message, frozen=True, kw_only=True):
     width: int
     height: int
     error: str = ""  # not empty: the frame has no pixels; this is the reason
+    # A buffer may lie between exposure and ``t_ns``: the stamp is of arrival, or by the sender of a network stream.
+    buffered: bool = False
 
 
 class VehicleState(Message, frozen=True, kw_only=True):

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
 import msgspec
 import numpy as np
 
+from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
 from terrafix.core.node import Edge, NodeContext
@@ -45,6 +45,7 @@ from terrafix.messages import (
     ClaimBudget,
     CovarianceMode,
     EkfDeadReckoning,
+    Frame,
     Health,
     Imu,
     InitialPosition,
@@ -122,6 +123,7 @@ class EstimatorNode:
             CandidateAttitude: self._on_candidate_attitude,
             EkfDeadReckoning: self._on_dead_reckoning,
             Health: self._on_health,
+            Frame: self._on_frame,
             Odometry: self._on_odometry,
             Relocalization: self._on_relocalization,
             MapMatch: self._on_map_match,
@@ -164,7 +166,8 @@ class EstimatorNode:
         self._axes = LocalFrame(origin.lat_deg, origin.lon_deg)
         self._predicted_id = None  # in other axes
         prior = self._prior(origin, self._axes)
-        self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior), TimeOffset())
+        offset = TimeOffset(Mount.of(origin.camera).r_b_c())
+        self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior), offset)
         waiting, self._early_dead_reckoning = self._early_dead_reckoning, []
         for sample in waiting:
             yield from self._on_dead_reckoning(sample)
@@ -246,6 +249,11 @@ class EstimatorNode:
 
     # --- frames --------------------------------------------------------------------------------------------------
 
+    def _on_frame(self, frame: Frame) -> Iterable[Message]:
+        if self._flight is not None:
+            self._flight.time_offset.buffered = frame.buffered
+        return ()
+
     def _on_odometry(self, odometry: Odometry) -> Iterable[Message]:
         self._waiting.append(odometry)
         return self._waiting_frames()
@@ -273,8 +281,7 @@ class EstimatorNode:
     def _frame(self, odometry: Odometry) -> Iterable[Message]:
         if self._estimator is None or self._flight is None:
             return
-        stamp_ns, time_offset = odometry.t_ns, self._flight.time_offset
-        before_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
+        stamped, time_offset = odometry, self._flight.time_offset
         if (camera_vehicle := self._camera_vehicle.on_odometry(odometry, self._estimator.origin.camera)) is not None:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
@@ -283,8 +290,6 @@ class EstimatorNode:
         self._relocated = False
         result = estimator.feed_frame(frame)
         self._tracked = result.verdict is Verdict.ACCEPTED
-        if result.turn is not None:
-            time_offset.add(replace(result.turn, t0_ns=before_ns, t1_ns=stamp_ns), self._telemetry)
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
         fragment = estimator.state.fragment_of(odometry.frame_id)
         yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict, fragment) for verdict in verdicts)
@@ -300,6 +305,8 @@ class EstimatorNode:
             agl_m = estimator.terrain.height_above_m(p)
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m)
             yield from self._monitors.take_changes(odometry.t_ns)
+            time_offset.add(stamped, self._telemetry, agl_m)
+            yield from time_offset.take_changes(odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:
             yield ClaimBudget(t_ns=odometry.t_ns, frame_id=odometry.frame_id, terms_m2=budget.terms_m2)

@@ -15,7 +15,6 @@ from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffD
 from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
 from terrafix.estimator.integrity.signed_innovations import SignedInnovations
-from terrafix.estimator.integrity.turn_comparison import Turn
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning, DeadReckoningAid
@@ -59,15 +58,13 @@ MOTION_TIMEOUT_S = 5.0  # of a vehicle with inertial aiding alone [spec: EKF2_NO
 @dataclass(frozen=True)
 class PropagationResult:
     """Result of ``advance``. ``verdict``: on the odometry of the frame. ``step_m`` (2,): east, north since the frame
-    before, by odometry alone, and its 1-sigma. ``turn``: since the frame before, by images. ``verdicts``: on all
-    measurements, and on a reset of the graph, in the order in which they were made. ``motion``: since the keyframe, by
+    before, by odometry alone, and its 1-sigma. ``verdicts``: on all measurements, and on a reset of the graph, in the order in which they were made. ``motion``: since the keyframe, by
     odometry, also of a fragment that is not confirmed; None: there is none, or a graph has begun with the frame."""
 
     verdict: Verdict
     placed: FrameState
     step_m: np.ndarray
     step_sigma_m: float
-    turn: Turn | None = None
     verdicts: tuple[FusionVerdict, ...] = ()
     motion: KeyframeMotion | None = None
 
@@ -107,13 +104,12 @@ class Propagation:
         before = state.graph.state(state.graph.newest)
         increment = functools.cache(lambda: self._increment(frame, before, fused=True))
         odometry = self._odometry.gated(frame, before, increment)
-        turn = self._odometry.turn(odometry)
         rejected = self._gate_heading(frame, odometry, before)
         if rejected is not None and self._heading_gate.should_reinitialise and state.last_fix_s is None:
             return self._initialize(frame, ResetReason.HEADING_GATE, rejected)
         if rejected is not None:
             frame = replace(frame, attitude=replace(frame.attitude, yaw_rad=None))
-        predicted = self._predict(frame, before, odometry, turn, increment if rejected is None else None)
+        predicted = self._predict(frame, before, odometry, increment if rejected is None else None)
         verdicts = [FusionVerdict("odometry", odometry.verdict, odometry.innovation)]
         verdicts += [] if rejected is None else [rejected]
         if result := self._reset_before_fusion(predicted, verdicts):
@@ -136,7 +132,6 @@ class Propagation:
         frame: FrameInput,
         before: NodeState,
         odometry: GatedOdometry,
-        turn: Turn | None,
         fused_increment: Callable[[], MotionIncrement] | None,
     ) -> PredictedFrame:
         """Motion model. ``fused_increment``: the increment of a frame with fused odometry, where it is known
@@ -153,7 +148,7 @@ class Propagation:
         p_m, motion = before.pose.translation(), np.zeros(MOTION_SIZE)
         if increment is not None:
             p_m, motion = increment.predict(p_m, before.motion, float(before.calibration[HEADING]))
-        return PredictedFrame(frame, before, odometry, turn, increment, p_m, motion, cov)
+        return PredictedFrame(frame, before, odometry, increment, p_m, motion, cov)
 
     def _increment(self, frame: FrameInput, before: NodeState, *, fused: bool) -> MotionIncrement:
         """Increment of the motion model, from ``before``, the newest node, to ``frame``. ``fused``: odometry
@@ -449,4 +444,4 @@ def _result(
     predicted: PredictedFrame, placed: FrameState, step: Step, verdicts: list[FusionVerdict]
 ) -> PropagationResult:
     verdict = predicted.odometry.verdict
-    return PropagationResult(verdict, placed, step.moved_m, step.sigma_m, predicted.turn, tuple(verdicts))
+    return PropagationResult(verdict, placed, step.moved_m, step.sigma_m, tuple(verdicts))
