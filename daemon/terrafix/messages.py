@@ -510,10 +510,13 @@ class CalibrationFault(Message, frozen=True, kw_only=True):
     """A monitor has detected a calibration fault, or its end; published on every change.
 
     ``quantity``: "scale" (height or focal length), "mount yaw", "heading", "mirrored picture", "registration" (frames
-    match the map nowhere, for an unknown reason)."""
+    match the map nowhere, for an unknown reason), "camera time" (stamps against the autopilot), "start" (the vehicle
+    stood on what moves)."""
 
     quantity: str
-    factor: float | None  # scale: reported over true height; angles: reported less true, degrees; None: unknown
+    factor: (
+        float | None
+    )  # scale: reported over true height; angles: reported less true, degrees; time: s late; None: unknown
     detail: str  # evidence of the fault
     active: bool
 

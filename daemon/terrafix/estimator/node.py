@@ -41,6 +41,7 @@ from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpo
 from terrafix.estimator.propagation import PropagationResult
 from terrafix.estimator.smoother_inputs import map_anchor, odometry_link, relocalization_link
 from terrafix.messages import (
+    CalibrationFault,
     CandidateAttitude,
     ClaimBudget,
     CovarianceMode,
@@ -69,6 +70,7 @@ TELEMETRY_WAIT_NS = 1_000_000_000  # the autopilot's heartbeat comes once a seco
 COOL = Health(
     t_ns=0, band=ThermalBand.NORMAL, temperature_c=None, throttled=False, disk_free_mb=None, cause="no reading yet"
 )
+START_QUANTITY = "start"
 BEFORE_TELEMETRY = "older than the autopilot's first messages after the restart"
 
 MakeEstimator = Callable[[Origin, NavPrior | None], Estimator]
@@ -114,6 +116,7 @@ class EstimatorNode:
         self._relocated = False  # a relocalisation has moved the estimate since
         self._monitors: Monitors | None = None
         self._rebuilds = 0  # of the graph
+        self._start_moved = False  # as reported
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
             Origin: self._on_origin,
             InitialPosition: self._on_initial_position,
@@ -307,6 +310,7 @@ class EstimatorNode:
             yield from self._monitors.take_changes(odometry.t_ns)
             time_offset.add(stamped, self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
+        yield from self._start_fault(estimator, odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:
             yield ClaimBudget(t_ns=odometry.t_ns, frame_id=odometry.frame_id, terms_m2=budget.terms_m2)
@@ -315,6 +319,14 @@ class EstimatorNode:
             self._ahrs.position_published(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
         yield from odometry_link(estimator, result, odometry.t_ns)  # last: it delays nothing
+
+    def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
+        moved = estimator.state.start_moved
+        if moved == self._start_moved:
+            return
+        self._start_moved = moved
+        detail = "the vehicle moves as if it had stood on what moves" if moved else "the map has placed it"
+        yield CalibrationFault(t_ns=t_ns, quantity=START_QUANTITY, factor=None, detail=detail, active=moved)
 
     def _in_telemetry_time(self, odometry: Odometry, time_offset: TimeOffset) -> Odometry:
         """``odometry``, with the estimated time offset of the camera taken from its time."""

@@ -58,8 +58,9 @@ MOTION_TIMEOUT_S = 5.0  # of a vehicle with inertial aiding alone [spec: EKF2_NO
 @dataclass(frozen=True)
 class PropagationResult:
     """Result of ``advance``. ``verdict``: on the odometry of the frame. ``step_m`` (2,): east, north since the frame
-    before, by odometry alone, and its 1-sigma. ``verdicts``: on all measurements, and on a reset of the graph, in the order in which they were made. ``motion``: since the keyframe, by
-    odometry, also of a fragment that is not confirmed; None: there is none, or a graph has begun with the frame."""
+    before, by odometry alone, and its 1-sigma. ``verdicts``: on all measurements, and on a reset of the graph, in the
+    order in which they were made. ``motion``: since the keyframe, by odometry, also of a fragment that is not
+    confirmed; None: there is none, or a graph has begun with the frame."""
 
     verdict: Verdict
     placed: FrameState
@@ -194,6 +195,8 @@ class Propagation:
             detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
             reset = _reset_verdict(ResetReason.VELOCITY, detail)
             return self._continue(replace(predicted, cov=cov), [*verdicts, reset])
+        if (off_mps := self._start_off_mps(predicted)) is not None:
+            return self._leave_start(predicted, off_mps, verdicts)
         above_m = None if odometry.fused is None else float(predicted.p_m[UP]) - state.terrain.ground_m
         if self._take_off.was_unmeasured(predicted.increment, above_m):
             # With the speed known at both ends a graph would be too sure of the distance between them.
@@ -203,6 +206,25 @@ class Propagation:
             verdicts = [*verdicts, _reset_verdict(ResetReason.UNMEASURED_TAKE_OFF)]
             return PropagationResult(Verdict.ACCEPTED, placed, predicted.step_m, sigma_m, verdicts=tuple(verdicts))
         return self._reset_yaw_gauge(predicted, verdicts)
+
+    def _start_off_mps(self, predicted: PredictedFrame) -> np.ndarray | None:
+        if self._state.last_fix_s is not None:  # the map tells where it started
+            return None
+        seen = self._state.continuity.keyframe_motion is not None and predicted.odometry.motion is not None
+        return self._take_off.start_off_mps(predicted.before, predicted.increment, seen=seen)
+
+    def _leave_start(
+        self, predicted: PredictedFrame, off_mps: np.ndarray, verdicts: list[FusionVerdict]
+    ) -> PropagationResult:
+        """The vehicle stood on what moves with ``off_mps`` (2,), for all that is known since the start: that is
+        no place any more."""
+        state, cov = self._state, predicted.cov.copy()
+        way_m = float(np.hypot(*off_mps)) * (predicted.frame.t_s - state.began_s)
+        cov[HORIZONTAL, HORIZONTAL] += way_m**2 * np.eye(2)
+        state.on_start_moved()
+        detail = f"{np.hypot(*off_mps):.1f} m/s at the take-off: the start may have moved by {way_m:.0f} m"
+        reset = _reset_verdict(ResetReason.MOVING_START, detail)
+        return self._continue(replace(predicted, cov=cov), [*verdicts, reset])
 
     def _reset_yaw_gauge(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult | None:
         """A new graph when the heading becomes known, or unobservable in motion without odometry. None: no reset."""

@@ -22,8 +22,8 @@ STEP_FLOOR_M = 0.5  # [tuned]
 
 @dataclass(frozen=True)
 class PredictedFrame:
-    """A frame after the motion model. ``before``: the newest node; ``increment``: since ``before``, None: the vehicle stands; ``p_m`` (3,) and ``motion`` (8,), V, at its end, and
-    ``cov`` (11, 11) of both."""
+    """A frame after the motion model. ``before``: the newest node; ``increment``: since ``before``, None: the vehicle
+    stands; ``p_m`` (3,) and ``motion`` (8,), V, at its end, and ``cov`` (11, 11) of both."""
 
     frame: FrameInput
     before: NodeState

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from terrafix.core.camera import Mount
-from terrafix.estimator.integrity.turn_comparison import TurnComparison, Turn
+from terrafix.estimator.integrity.turn_comparison import Turn, TurnComparison
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.monitors.visual_motion import image_turn
 from terrafix.messages import (

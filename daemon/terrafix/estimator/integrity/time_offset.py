@@ -15,31 +15,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
-from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_S2, STEP_S, Hazards, predicted
+from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_S2, Hazards, predicted
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.monitors.visual_motion import MIN_DOWN, MIN_PAIRS
 from terrafix.messages import CalibrationFault, Odometry, Verdict
 
 # 1-sigma of the offset of frames that are stamped on arrival: exposure, readout and transfer of USB cameras [s].
 PRIOR_SIGMA_S = 0.03  # [tuned]
-FAR_S = 3.0 * PRIOR_SIGMA_S  # s: an offset beyond it is not that of transfer alone
+FAR_S = 3.0 * PRIOR_SIGMA_S  # s: a larger offset is not that of transfer alone [spec: three sigmas]
 UNSTAMPED_SHARE = 0.01  # of cameras whose buffers or pipeline may delay by anything on the grid [tuned]
-OUTSIDE_S = 5.0  # s, 1-sigma of an offset at the end of the grid, which may be any larger one [spec: twice the grid]
+OUTSIDE_S = 5.0  # s, 1-sigma of an offset at the end of the grid, or beyond it [spec: the width of the grid]
 # Hazard of a buffer that lies between exposure and stamp: one that begins to fill in an hour of flight, one that jumps
 # in five; elsewhere a false alarm of the monitors. [spec: FALSE_ALARM_HOURS, monitors/cusum.py, at a stamp of exposure]
 BUFFERED, STAMPED = Hazards(1.0 / 3600.0, 0.2 / 3600.0), Hazards(1.0 / 3.6e6, 1.0 / 3.6e6)
 MAX_PAIRS = 24  # of an image, spread over it: more do not improve what the attitude's noise limits [measured: 40 pairs]
-MIN_SPAN_NS = 400_000_000  # ns between two frames that are compared: the noise of an attitude grows slower than motion [measured: 3 flights]
+# ns between two frames that are compared: the error of an attitude grows slower than what the vehicle turns.
+MIN_SPAN_NS = 400_000_000  # [measured: docs/decisions/058]
 MIN_TURN_SIGMA_RAD, MIN_TILT_SIGMA_RAD = np.radians(0.1), np.radians(0.05)  # of changes between two frames [tuned]
 MOUNT_SIGMA_RAD = np.radians(3.0)  # 1-sigma of the mount's tilt, by which a roll looks like a turn, or a jump [tuned]
 ACCELERATION_SIGMA_MPS2 = 3.0  # of a vehicle without inertial readings [tuned: monitors/levelling.py]
-INERTIAL_SIGMA_MPS2 = 0.2  # with them: a tilt that is wrong by a degree
+INERTIAL_SIGMA_MPS2 = 0.2  # with them: a tilt that is wrong by a degree [spec: attitude_sigma_deg]
 NOISE_MEMORY = 50.0  # comparisons: time constant of the noise [tuned]
-# Of two comparisons that share a frame, and their attitudes a second's error [tuned]
-INDEPENDENT_SHARE = 0.5
-# Least share of the noise that is the images', when the attitude's is not to be told from what moved [measured: no
-# offset over 5 % in 12 flights of a plane at 2 and 5 Hz; without a limit 44 % of the frames of one]
-MIN_NOISE_SHARE = 0.5
+INDEPENDENT_SHARE = 0.5  # of the comparisons: two consecutive ones share a frame [tuned]
+# Least share of the noise that the images have. Without a limit two of three healthy flights had a false offset.
+MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
 MAX_NATS = 6.0  # of one comparison: twice MAX_STEP of the monitors [spec: monitors/cusum.py]
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
 APPLY_MAX_SIGMA_S = 0.25  # s: largest 1-sigma of an offset that is applied [tuned]
@@ -174,7 +173,7 @@ class TimeOffset:
             return []  # not sure yet
         self._reported_s = mean_s if active else None
         now_s = mean_s if active else self.applied_s
-        detail = "images show roll, pitch and turns later than the autopilot reports them: a buffer fills, or stamps are late"
+        detail = "images show roll, pitch and turns at another time than the autopilot reports them"
         if not active:
             detail = "it is subtracted from the time stamps" if now_s else "images and attitude agree in time"
         return [CalibrationFault(t_ns=t_ns, quantity=QUANTITY, factor=now_s, detail=detail, active=active)]

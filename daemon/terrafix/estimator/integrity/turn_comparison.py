@@ -1,20 +1,17 @@
-"""Time offset between camera and autopilot, from turns that both observe (the calibration state td of OpenVINS; Qin and
-Shen 2018, "Online temporal calibration for monocular visual-inertial systems").
+"""How well the turns of a vehicle explain those of the images, at an unknown time offset between both.
 
-A frame with a time stamp that is late by ``offset_s`` shows a turn that much after the autopilot reports it. The offset
-has a density over a grid. Its prior is a mixture: cameras that stamp their frames, and a small share that does not.
-The noise of the turns is marginalised, so that a wandering compass widens the density. So is the error of the camera's
-mount pitch: with a wrong one, a roll of the vehicle looks like a turn, as it does with a time offset."""
+A frame with a time stamp that is late by ``offset_s`` shows a turn that much after the autopilot reports it. The prior
+of the offset is a mixture: cameras that stamp their frames, and a small share that does not. The noise of the turns is
+marginalised, and so is the error of the camera's mount pitch: with a wrong one, a roll of the vehicle looks like a
+turn."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.core.gate import MIN_COMPONENT_WEIGHT
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 
 GRID_S = np.arange(-2.0, 2.0001, 0.05)  # s: offsets of the density [tuned]
-RESOLUTION_S2 = (GRID_S[1] - GRID_S[0]) ** 2 / 12.0  # s^2 [spec: variance of a uniform density over a grid cell]
 # 1-sigma of the offset of frames that are stamped on arrival: exposure, readout and transfer of USB cameras [s].
 PRIOR_SIGMA_S = 0.03  # [tuned]
 UNSTAMPED_SHARE = 0.01  # of cameras whose buffers or pipeline may delay by anything on the grid [tuned]
@@ -23,9 +20,6 @@ MOUNT_PITCH_SIGMA_RAD = np.radians(1.5)  # 1-sigma of the mount pitch that remai
 INDEPENDENT_SHARE = 0.5  # of the turns: two consecutive ones share a reported heading and a keyframe [tuned]
 MEMORY_TURNS = 300.0  # turns: time constant of the exponential forgetting of the sums [tuned]
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
-APPLY_MIN_SIGMAS = 4.0  # 1-sigmas by which an offset differs from 0 before it is applied [tuned]
-APPLY_MAX_SIGMA_S = 0.1  # s: largest 1-sigma of an offset that is applied [tuned]
-MAX_SLEW = 0.2  # s/s: rate of change of the applied offset [tuned]
 
 
 @dataclass(frozen=True)
@@ -38,10 +32,9 @@ class Turn:
 
 
 class TurnComparison:
-    """``applied_s``: the offset to subtract from the time stamps of frames; 0 until it is significant."""
+    """``evidence`` of the turns that were added."""
 
     def __init__(self) -> None:
-        self.applied_s = 0.0
         self._pending: list[Turn] = []  # until attitudes have arrived that are as late as the grid reaches
         # Sums over turns, for each offset of the grid: squares of the residual "visual less reported turn", products of
         # residual and change of roll, squares of the change of roll, squares of the visual and of the reported turn.
@@ -61,20 +54,6 @@ class TurnComparison:
             self._accumulate(self._pending.pop(0), telemetry)
         while self._pending and self._pending[0].t1_ns + 2 * reach_ns < frame_ns:  # no heading is reported
             del self._pending[0]
-
-    @property
-    def density(self) -> tuple[np.ndarray, float]:
-        """-> probabilities over ``GRID_S``, and the probability of a camera that does not stamp its frames."""
-        stamped, unstamped = (
-            (1.0 - UNSTAMPED_SHARE) * _normal(GRID_S, PRIOR_SIGMA_S),
-            np.full(len(GRID_S), UNSTAMPED_SHARE / (GRID_S[-1] - GRID_S[0])),
-        )
-        if self._count > 0.0:
-            log = self._log_likelihood(self._noise)
-            likelihood = np.exp(log - log.max())
-            stamped, unstamped = stamped * likelihood, unstamped * likelihood
-        total = float(stamped.sum() + unstamped.sum())
-        return (stamped + unstamped) / total, float(unstamped.sum()) / total
 
     @property
     def evidence(self) -> tuple[float, float]:
@@ -99,32 +78,6 @@ class TurnComparison:
     def _log_likelihood(self, variance: np.ndarray) -> np.ndarray:
         """Of the turns so far, whose ``variance`` is that of their own mean square."""
         return np.asarray(-0.5 * INDEPENDENT_SHARE * self._count * np.log(variance))
-
-    @property
-    def estimate(self) -> tuple[float, float]:
-        """Mean and 1-sigma of the density [s]."""
-        density, _ = self.density
-        mean = float(density @ GRID_S)
-        return mean, float(np.sqrt(density @ (GRID_S - mean) ** 2 + RESOLUTION_S2))
-
-    @property
-    def sigma_s(self) -> float:
-        """1-sigma of the offset that remains after correction.
-
-        The prior's sigma limits it until the probability of a camera that does not stamp its frames reaches
-        MIN_COMPONENT_WEIGHT, where that component affects a 95 % ellipse."""
-        density, unstamped = self.density
-        remaining_s = float(np.sqrt(density @ (GRID_S - self.applied_s) ** 2 + RESOLUTION_S2))
-        return remaining_s if unstamped >= MIN_COMPONENT_WEIGHT else min(remaining_s, PRIOR_SIGMA_S)
-
-    def step(self, dt_s: float) -> None:
-        """Moves ``applied_s`` towards the estimate if that is significant, else towards 0. ``dt_s``: since the last
-        frame."""
-        mean_s, sigma_s = self.estimate
-        significant = sigma_s < APPLY_MAX_SIGMA_S and abs(mean_s) > APPLY_MIN_SIGMAS * max(sigma_s, PRIOR_SIGMA_S)
-        target_s = mean_s if significant else 0.0
-        max_step_s = MAX_SLEW * max(dt_s, 0.0)
-        self.applied_s += float(np.clip(target_s - self.applied_s, -max_step_s, max_step_s))
 
     def _accumulate(self, turn: Turn, telemetry: Telemetry) -> None:
         shift_ns = np.round(GRID_S * 1e9).astype(np.int64)

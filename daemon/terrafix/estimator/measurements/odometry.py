@@ -1,14 +1,12 @@
 """Visual odometry as a measurement: the motion of a frame over the ground since its keyframe, gated against the motion
 model, and what three keyframes saw together."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from terrafix.core.geodesy import yaw_of
 from terrafix.estimator.factors.three_view import ThreeViewConstraint, ThreeViewPose, three_view_constraint
 from terrafix.estimator.filter_state import FilterState, FrameInput
 from terrafix.estimator.integrity.fragments import Fragment, MotionEvidence

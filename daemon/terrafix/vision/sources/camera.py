@@ -204,8 +204,8 @@ def is_stream_url(spec: str) -> bool:
 
 
 def _timestamp_ns(capture: Capture, arrival_ns: int) -> tuple[int, bool]:
-    """-> timestamp of the grabbed frame, and whether a buffer may lie between the exposure and it. V4L2 uses the monotonic clock (V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC) and OpenCV
-    returns it as POS_MSEC."""
+    """-> timestamp of the grabbed frame, and whether a buffer may lie between the exposure and it. V4L2 uses the
+    monotonic clock (V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC) and OpenCV returns it as POS_MSEC."""
     if isinstance(capture, MjpegCapture):
         return capture.stamp_ns or arrival_ns, True
     driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
