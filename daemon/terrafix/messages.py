@@ -54,6 +54,7 @@ class Verdict(StrEnum):
 
     ACCEPTED = "accepted"
     BAD_IMAGE = "bad_image"  # unreadable, truncated, wrong size
+    OVERTAKEN = "overtaken"  # left out: the computer was busy until a newer frame was there
     STALLED = "stalled"  # the camera repeats an earlier image while the vehicle moves
     NO_FEATURES = "no_features"  # no features to track
     FEW_INLIERS = "few_inliers"  # too few or too small a share of the matches agree with one motion or camera pose

@@ -84,6 +84,7 @@ PROCESSES: tuple[Process, ...] = (
         "terrafix.link.node",
         (
             m.Origin,
+            m.Frame,
             m.NavEstimate,
             m.CalibrationFault,
             m.CameraVehicle,

@@ -51,14 +51,14 @@ TERRAFIX = "/opt/terrafix/venv/bin/terrafix"
 UNIT_WORDS = ("run", "--config", "/etc/terrafix/terrafix.toml", "--out", "/var/lib/terrafix/%b")  # of ExecStart=
 IMPORTS = """
 import importlib, importlib.metadata, importlib.util, pkgutil, platform
-import numpy, terrafix, terrafix_engines, terrafix_lab, terrafix_tools
+import numpy, terrafix, terrafix_engines, terrafix_tools
 owners = importlib.metadata.packages_distributions().items()
 packages = sorted(name for name, of in owners if name.isidentifier() and not {"pip", "setuptools"} & {*of})
 packages = [name for name in packages if importlib.util.find_spec(name)]  # some say that they have more than they have
 absent = set()
 for name in packages:
     importlib.import_module(name)
-ours = (terrafix, terrafix_engines, terrafix_lab, terrafix_tools)
+ours = (terrafix, terrafix_engines, terrafix_tools)
 found = [m.name for p in ours for m in pkgutil.walk_packages(p.__path__, p.__name__ + ".")]
 modules = [name for name in found if not name.endswith("__main__")]
 for name in modules:
@@ -184,9 +184,9 @@ def vehicle(debian: Vehicle, table: Table) -> Vehicle:
     with table.row("wheels of aarch64") as seen:
         fresh = debian.root / "opt" / "fresh"
         shutil.rmtree(fresh, ignore_errors=True)
-        pip("wheel", "--quiet", "--no-deps", "--wheel-dir", fresh, ROOT)
-        (wheel,) = fresh.iterdir()
-        digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+        pip("wheel", "--quiet", "--no-deps", "--wheel-dir", fresh, ROOT, ROOT / "tools")
+        (wheel,) = fresh.glob("terrafix-*.whl")
+        digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(fresh.iterdir()))).hexdigest()
         if made.exists() and made.read_text() == digest:
             seen.append("the same as installed before")
             return debian
@@ -200,7 +200,9 @@ def vehicle(debian: Vehicle, table: Table) -> Vehicle:
         do(sys.executable, "-m", "terrafix_tools.cli", "files", files)
         if (debian.root / PYTHON.lstrip("/")).is_symlink():
             (site_packages(debian.root) / "extra.pth").unlink(missing_ok=True)
-            debian.do(PYTHON, "-m", "pip", "uninstall", "--yes", "terrafix")  # the same version, of an older tree
+            debian.do(
+                PYTHON, "-m", "pip", "uninstall", "--yes", "terrafix", "terrafix-ground"
+            )  # the same version, of an older tree
         install = ("sh", "/opt/files/systemd/install.sh", "--package", f"/opt/wheels/{wheel.name}")
         debian.do(*install, PIP_NO_INDEX="1", PIP_FIND_LINKS="/opt/wheels", PIP_NO_COMPILE="1")
         assert (debian.root / TERRAFIX.lstrip("/")).is_file()
@@ -214,14 +216,16 @@ def tree(vehicle: Vehicle, table: Table) -> Vehicle:
     """With the tests and what they need beside Terrafix, at the end of the path: what is installed comes first."""
     with table.row("tests and the extra `ground`") as seen:
         extra = vehicle.root / "opt" / "extra"
-        (wheel,) = (vehicle.root / "opt" / "wheels").glob("terrafix-*.whl")
+        wheels = vehicle.root / "opt" / "wheels"
+        (wheel,), (ground,) = wheels.glob("terrafix-*.whl"), wheels.glob("terrafix_ground-*.whl")
         if not extra.exists():
-            lock = ("--constraint", ROOT / "requirements.lock", *of_the_vehicle())
+            lock = ("--constraint", ROOT / "requirements.lock", "--find-links", wheels, *of_the_vehicle())
             pip("install", "--quiet", "--no-compile", *lock, "--target", f"{extra}.part", f"{wheel}[ground,dev]")
             for own in Path(f"{extra}.part").glob("terrafix*"):
                 shutil.rmtree(own)
             Path(f"{extra}.part").rename(extra)
         (site_packages(vehicle.root) / "extra.pth").write_text("/opt/extra\n")
+        vehicle.do(PYTHON, "-m", "pip", "install", "--no-deps", f"/opt/wheels/{ground.name}", PIP_NO_INDEX="1")
         tree = vehicle.root / "opt" / "tree"
         shutil.rmtree(tree, ignore_errors=True)
         left_out = shutil.ignore_patterns(".*", "out", "__pycache__", "*.egg-info")

@@ -26,12 +26,13 @@ GROUND_PORT = 14551  # of config/ground-station.toml
 class Installed:
     """The command `terrafix` of a virtual environment of its own, run in ``work`` with nothing of the source tree."""
 
-    def __init__(self, folder: Path, wheel: Path, extras: str, work: Path) -> None:
+    def __init__(self, folder: Path, wheels: Path, name: str, work: Path) -> None:
+        """``name``: what is installed from the folder ``wheels``, with its extras."""
         self.python, self._command, self._work = folder / "bin" / "python", folder / "bin" / "terrafix", work
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True, timeout=INSTALL_S)
         pip = [str(self.python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-        lock = ["--constraint", str(ROOT / "requirements.lock")]
-        subprocess.run([*pip, *lock, f"{wheel}{extras}"], check=True, timeout=INSTALL_S)
+        lock = ["--constraint", str(ROOT / "requirements.lock"), "--find-links", str(wheels)]
+        subprocess.run([*pip, *lock, name], check=True, timeout=INSTALL_S)
         self._environment = {"PATH": "/usr/bin:/bin", "HOME": str(work), "LANG": "C.UTF-8", "OMP_NUM_THREADS": "1"}
 
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
@@ -64,53 +65,60 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
-    subprocess.run(pip, check=True, timeout=INSTALL_S)
-    (built,) = folder.iterdir()
-    return built
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the two wheels of the project."""
+    folder = tmp_path_factory.mktemp("wheels")
+    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder)]
+    subprocess.run([*pip, str(ROOT), str(ROOT / "tools")], check=True, timeout=INSTALL_S)
+    return folder
 
 
 @pytest.fixture(scope="module")
-def aircraft(tmp_path_factory: pytest.TempPathFactory, wheel: Path, work: Path) -> Installed:
-    return Installed(tmp_path_factory.mktemp("aircraft"), wheel, "", work)
+def aircraft(tmp_path_factory: pytest.TempPathFactory, wheels: Path, work: Path) -> Installed:
+    return Installed(tmp_path_factory.mktemp("aircraft"), wheels, "terrafix", work)
 
 
 @pytest.fixture(scope="module")
-def ground(tmp_path_factory: pytest.TempPathFactory, wheel: Path, work: Path) -> Installed:
+def ground(tmp_path_factory: pytest.TempPathFactory, wheels: Path, work: Path) -> Installed:
     """With the flight of the demo and its map in ``work``/out, as the README has them."""
-    installed = Installed(tmp_path_factory.mktemp("ground"), wheel, "[ground,console]", work)
+    installed = Installed(tmp_path_factory.mktemp("ground"), wheels, "terrafix[ground,console]", work)
     installed.do("demo --duration 30")
     installed.do("map build out/demo/map.tif --dem out/demo/dem.tif --date 2020-07-10 --out out/place.gpkg")
     return installed
 
 
-def test_the_aircrafts_environment_has_neither_gdal_nor_a_web_server(aircraft: Installed) -> None:
-    code = "import importlib.util as u; print([n for n in ('rasterio', 'fastapi', 'dask') if u.find_spec(n)])"
+def test_the_aircrafts_environment_has_neither_gdal_nor_a_web_server_nor_the_lab(aircraft: Installed) -> None:
+    names = ("rasterio", "fastapi", "dask", "terrafix_lab", "terrafix_tools.console")
+    code = f"import importlib.util as u; print([n for n in {names} if u.find_spec(n)])"
     done = subprocess.run([str(aircraft.python), "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
     refused = aircraft.run("map", "build", "nowhere.tif", "--out", "out/nowhere.gpkg")
     assert refused.returncode == 2 and "pip install 'terrafix[ground]'" in refused.stderr
 
 
-def test_every_command_explains_itself_without_the_extras(aircraft: Installed) -> None:
+@pytest.mark.parametrize(
+    ("place", "some"),
+    [("aircraft", {"run", "replay", "report", "preflight"}), ("ground", {"run", "fleet", "serve", "demo", "bench"})],
+)
+def test_every_command_explains_itself(request: pytest.FixtureRequest, place: str, some: set[str]) -> None:
+    installed: Installed = request.getfixturevalue(place)
     commands = [
-        line.split()[1] for line in aircraft.do("--help").splitlines() if line.startswith("│ ") and line[2] > " "
+        line.split()[1] for line in installed.do("--help").splitlines() if line.startswith("│ ") and line[2] > " "
     ]
     commands = [name for name in commands if name[0] != "-"]
-    assert {"run", "replay", "report", "serve", "fleet", "preflight"} <= set(commands)
+    assert some <= set(commands)
     for name in commands:
-        aircraft.do(f"{name} --help")
+        installed.do(f"{name} --help")
 
 
-@pytest.mark.usefixtures("ground")
-def test_a_flight_is_replayed_evaluated_and_reported_without_gdal(aircraft: Installed, work: Path) -> None:
+def test_a_flight_is_replayed_evaluated_and_reported_without_gdal(
+    aircraft: Installed, ground: Installed, work: Path
+) -> None:
     aircraft.do("replay out/demo/flight --map out/place.gpkg --out out/replay")
     assert "ellipse95_coverage" in aircraft.do("evaluate out/replay --truth out/demo/flight/truth.csv")
     aircraft.do("report out/replay --truth out/demo/flight/truth.csv")
     assert "<svg" in (work / "out/replay/report.html").read_text(encoding="utf-8")
-    aircraft.do("finalise out/replay")
+    ground.do("finalise out/replay")
     assert (work / "out/replay/finalised.csv").is_file()
 
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from terrafix.messages import SearchStep
-from terrafix_lab.accept.faults import flight_edits
 from terrafix_lab.accept.flight import open_flight
 from terrafix_lab.accept.measuring import measures
 from terrafix_lab.accept.measuring.evidence import gather
 from terrafix_lab.accept.measuring.results import Marks
+from terrafix_lab.faults import edits
+from terrafix_lab.faults.source import AlteredSource
 from terrafix_tools.replay import replay
 
 FRAMES = 85
@@ -31,17 +32,15 @@ def test_a_foreign_frame_is_rejected_and_a_gap_in_a_turn_is_bridged(
     far = int(np.argmax(away_m >= FAR_M))
     assert away_m[far] >= FAR_M
     next_file = flight.frame_refs[INSERTED_BEFORE].file
-    inserted = flight_edits.foreign_frames({next_file: flight.picture(far)})
-    gap = flight_edits.without_frames(frozenset(flight.frame_refs[i].file for i in TURN))
+    inserted = edits.foreign_frames({next_file: flight.picture(far)})
+    gap = edits.without_frames(frozenset(flight.frame_refs[i].file for i in TURN))
     replay(
         folder,
         None,
         tmp_path,
-        wrap_source=lambda source: flight_edits.AlteredSource(
-            source, lambda shots: gap(inserted(shots)), frames=FRAMES, origin=flight_edits.unchanged_origin
-        ),
+        wrap_source=lambda source: AlteredSource(source, lambda shots: gap(inserted(shots)), frames=FRAMES),
     )
-    marks = Marks(wrong_files=frozenset({flight_edits.foreign_name(next_file)}))
+    marks = Marks(wrong_files=frozenset({edits.foreign_name(next_file)}))
     evidence = gather(tmp_path, flight.truth, marks)
     assert len(evidence.frames) == FRAMES + 1 - len(TURN)
     assert measures.wrong_rejected(evidence).value == 1.0

@@ -12,15 +12,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, NavEstimate
 from terrafix.processes import PROCESSES
-from terrafix_lab.chaos.camera import Look, StreamedCamera, altered, camera_toml
+from terrafix_lab.chaos.camera import StreamedCamera, camera_toml
 from terrafix_lab.chaos.scene import Scene
 from terrafix_lab.chaos.verdict import back_s
+from terrafix_lab.faults.pictures import halved
 from terrafix_lab.sim.autopilot.course import PeerState
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.autopilot.peer import AutopilotPeer
@@ -95,12 +97,18 @@ class Surroundings:
         return longest_gap_s(self.peer.received_s, from_s, time.monotonic())
 
 
+def shrunk(jpeg: bytes) -> bytes:
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return cv2.imencode(".jpg", halved(image))[1].tobytes()
+
+
 def slower(scene: Scene, times: float, folder: Path) -> Scene:
     """The same flight, ``times`` as slow, and as many images, of half the width and height, which are written into
     ``folder``: for a computer that needs longer for each."""
     folder.mkdir(exist_ok=True)
     for jpeg in scene.jpegs:
-        (folder / jpeg.name).write_bytes(altered(jpeg.read_bytes(), Look.SMALL))
+        (folder / jpeg.name).write_bytes(shrunk(jpeg.read_bytes()))
 
     def course(t_s: float) -> PeerState:
         state = scene.course(t_s / times)

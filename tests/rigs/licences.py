@@ -46,7 +46,8 @@ def project() -> dict[str, list[Requirement]]:
     """Declared requirements by extra; "" is what every installation has."""
     table = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = {"": table["dependencies"], **table["optional-dependencies"]}
-    return {extra: [Requirement(line) for line in lines] for extra, lines in extras.items() if extra not in NOT_SHIPPED}
+    libraries = {extra: [line for line in lines if not line.startswith("terrafix-")] for extra, lines in extras.items()}
+    return {extra: [Requirement(line) for line in libraries[extra]] for extra in extras if extra not in NOT_SHIPPED}
 
 
 def closure(requirements: list[Requirement]) -> set[str]:

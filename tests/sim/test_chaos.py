@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from terrafix_lab.chaos.faults import killed
 from terrafix_lab.chaos.run import fly_cell
-from terrafix_lab.chaos.scene import Phase, Scene, course_of
+from terrafix_lab.chaos.scene import Scene, course_of
+from terrafix_lab.faults.fault import Phase
+from terrafix_lab.faults.processes import killed
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights.folder import flight_over, write_flight
 from terrafix_lab.sim.flights.scene import scene_of_place

@@ -21,12 +21,16 @@ if TYPE_CHECKING:
     from terrafix.runtime.fork_server import ForkServer
     from terrafix.runtime.run_dir import RunDir
 
-# optional packages of the extra `ground`; not installed on a vehicle
-GROUND_PACKAGES = ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog")
+# Modules that are not on a vehicle, by the extra that brings them: how their names begin.
+EXTRAS = {
+    "console": (
+        "fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "python_multipart", "pydantic",
+        "terrafix_tools.console",
+    ),
+    "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "terrafix_"),
+}  # fmt: skip
 # a full disk, or one over its quota
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
-# and of the extra `console`
-CONSOLE_PACKAGES = ("fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "python_multipart", "pydantic")
 
 # Commands of modules of their own: a function, or a Typer app with commands below it. Imported when they are called, so
 # that a start in flight is fast. The lab is named here and imported by nothing: it may not be installed.
@@ -35,6 +39,7 @@ MODULES = {
     "status": "terrafix_tools.status.cli:status",
     "hint": "terrafix_tools.hint.cli:hint",
     "log": "terrafix_tools.log.cli:app",
+    "source": "terrafix_tools.source.cli:app",
     "files": "terrafix_tools.files.cli:files",
     "models": "terrafix_tools.models.cli:app",
     "map": "terrafix_tools.mapping.cli:app",
@@ -277,10 +282,11 @@ def main(fork_server: "ForkServer | None" = None) -> None:
         )
         sys.exit(OutputError.exit_code)
     except ModuleNotFoundError as error:
-        missing = (error.name or "").split(".")[0]
-        extra = "ground" if missing in GROUND_PACKAGES else "console" if missing in CONSOLE_PACKAGES else ""
+        name = error.name or ""
+        extra = next((extra for extra, beginnings in EXTRAS.items() if name.startswith(beginnings)), "")
         if not extra:
             raise
+        missing = "terrafix-ground" if name.startswith("terrafix") else name.split(".")[0]
         typer.echo(f"terrafix: this command needs {missing}; install it: pip install 'terrafix[{extra}]'", err=True)
         sys.exit(UsageError.exit_code)
 

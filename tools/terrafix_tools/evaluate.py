@@ -17,7 +17,7 @@ from terrafix.core.errors import EvaluationError, OutputError
 from terrafix.core.toml_file import read_toml
 from terrafix.recorder.reader import ReadResult, check_format, is_record, read_flight
 from terrafix_tools.estimates import ESTIMATES, Row, RowTable, number, read_rows, read_table
-from terrafix_tools.finalise.output import TABLE as FINALISED
+from terrafix_tools.finalised import TABLE as FINALISED
 from terrafix_tools.score import FALSE_FIX_ERROR_M, coverage, error_summary, is_false_fix, nees_of
 
 WEIGHTS_FREE = "gradient"  # beginning of MapMatch.matcher of a frame for which no learned model ran

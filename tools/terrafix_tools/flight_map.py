@@ -4,6 +4,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from terrafix.core.errors import MapError
+
 
 def map_of_flight(folder: Path, given: Path | None, summary: dict[str, Any], header: dict[str, Any]) -> Path | None:
     """The map ``given`` by the user, or the one that summary.json or the configuration in the ``header`` of the record
@@ -21,7 +23,13 @@ def package_of(path: Path, *, progress: bool = False) -> Path:
     installed on a vehicle. Raises MapError, OutputError."""
     if path.suffix.lower() == ".gpkg":
         return path
-    from terrafix_tools.mapping.build import ensure_package
+    try:
+        from terrafix_tools.mapping.build import ensure_package
+    except ModuleNotFoundError:
+        raise MapError(
+            f"{path}: no map package (.gpkg); this installation makes none: use `terrafix map build` on the ground, or "
+            "pip install 'terrafix[ground]'"
+        ) from None
 
     return ensure_package(path, map_cache_dir(), progress=progress)
 

@@ -13,6 +13,7 @@ from terrafix.link.pilot_text.statustext import fault_text
 from terrafix.messages import CalibrationFault, MeasurementVerdict, Origin, SourceLabel, Verdict
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import NS, Row, RowTable
+from terrafix_tools.likely_cause import likely_cause
 
 MAX_UNCONFIRMED_S = DEGRADATION_LEVELS[1][
     0
@@ -34,6 +35,7 @@ class FlightVerdict:
     share: float  # of all frames, those that can be trusted
     reasons: list[str]
     active_faults: list[str]  # at the end of the flight
+    cause: str = ""  # the likely one, of a flight that found nothing on the map
 
     @property
     def label(self) -> str:
@@ -44,11 +46,13 @@ class FlightVerdict:
     def text(self) -> str:
         """One line for the operator."""
         because = f" ({'; '.join(self.reasons)})" if self.reasons else ""
+        cause = f" Likely cause: {self.cause}." if self.cause else ""
         if not self.spans or self.share == 1.0:
-            return f"{self.label.capitalize()}{because}."
+            return f"{self.label.capitalize()}{because}.{cause}"
         shown = ", ".join(f"from {a:.1f} s to {b:.1f} s" for a, b in self.spans[:MAX_SHOWN_SPANS])
         more = len(self.spans) - MAX_SHOWN_SPANS
-        return f"Trust it {shown}{f' and in {more} more spans' if more > 0 else ''}, and no more than that{because}."
+        others = f" and in {more} more spans" if more > 0 else ""
+        return f"Trust it {shown}{others}, and no more than that{because}.{cause}"
 
     def as_json(self) -> dict[str, Any]:
         """The dict that summary.json contains."""
@@ -58,6 +62,7 @@ class FlightVerdict:
             "trusted_share": round(self.share, 6),
             "reasons": self.reasons,
             "active_faults": self.active_faults,
+            "cause": self.cause,
             "text": self.text(),
         }
 
@@ -96,7 +101,9 @@ def flight_verdict(
     if not rows:
         reasons = ["no frame"]
     share = sum(not reason for reason in distrust) / max(len(rows), 1)
-    return FlightVerdict(spans, share, reasons, [_fault_name(fault) for _, fault in active.values()])
+    anchored = sum(row.anchor_age_ms == 0 for row in rows)
+    cause = likely_cause(len(rows), anchored, (fault for _, fault in ordered), verdict_counts)
+    return FlightVerdict(spans, share, reasons, [_fault_name(fault) for _, fault in active.values()], cause)
 
 
 def verdict_of(folder: Path) -> FlightVerdict:

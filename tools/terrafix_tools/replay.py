@@ -24,7 +24,8 @@ from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import header, versions
-from terrafix.vision.sources import Source, open_source
+from terrafix.vision.sources import Source, open_configured
+from terrafix.vision.sources.facts import facts_of
 from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import StoredModel, models_folder, resolve_model
 from terrafix_tools.flight_map import package_of
@@ -32,6 +33,7 @@ from terrafix_tools.in_process import InProcessShell
 from terrafix_tools.live import swapped_hint
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.rerun.frames import RecordedFrames
+from terrafix_tools.source.text import fact_lines
 
 # processes that compute the estimate; link, health and recorder need a live system
 REPLAYED_PROCESSES = ("vision", "anchor", "estimator", "smoother")
@@ -69,12 +71,17 @@ def replay(
     """
     began_s = time.perf_counter()
     config = _with_models(load(configs or []), models or [])
-    source = wrap_source(open_source(str(flight), start=start) if isinstance(flight, (str, Path)) else flight)
+    opened = open_configured(config.source, str(flight), start) if isinstance(flight, (str, Path)) else flight
+    source = wrap_source(opened)
     if source.live:
         raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
     package = package_of(_map_of(map_path, config, source), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
-    with ReplayOutput(out, header(config, package.resolve()), config.recorder) as output:
+    facts = facts_of(opened)
+    if progress:
+        for line in fact_lines(source.name(), facts):
+            Console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)
+    with ReplayOutput(out, header(config, package.resolve(), facts), config.recorder) as output:
         frames = MemoryFrameStore(FRAMES_KEPT)
         ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
         published: list[Message] = []
@@ -84,6 +91,7 @@ def replay(
         summary = {
             "flight": source.name(),
             "source": str(flight.record) if isinstance(flight, RecordedFrames) else _name_of(flight),
+            "source_facts": [fact._asdict() for fact in facts],
             "map": map_summary,
             "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v and k not in NOT_MODELS},
             "config": msgspec.to_builtins(config),

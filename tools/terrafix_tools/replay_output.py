@@ -28,8 +28,8 @@ from terrafix.recorder.images import ImagePolicy
 from terrafix.recorder.reader import read_frame_images, read_thumbnails
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, RowTable, write_rows
-from terrafix_tools.finalise.output import SUMMARY as FINALISED_SUMMARY
-from terrafix_tools.finalise.output import TABLE as FINALISED_TABLE
+from terrafix_tools.finalised import SUMMARY as FINALISED_SUMMARY
+from terrafix_tools.finalised import TABLE as FINALISED_TABLE
 from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.lens_report import lens_words
 

@@ -80,6 +80,7 @@ class RecorderSection(Section, frozen=True, kw_only=True):
 
 class HealthSection(Section, frozen=True, kw_only=True):
     sysfs_root: str = "/sys"
+    zones: list[str] = []  # names of the zones that decide the thermal band; empty: all that measure something
     hot_c: Annotated[float, Meta(ge=30, le=120)] = 80.0
     critical_c: Annotated[float, Meta(ge=30, le=120)] = 95.0
     hysteresis_c: Annotated[float, Meta(ge=0, le=30)] = 5.0

@@ -21,6 +21,7 @@ from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.time_offset import TimeOffset
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
+from terrafix.estimator.measurements.odometry import NO_NEW_VIEW
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.monitors.calibration_monitors import Monitors
 from terrafix.estimator.output import (
@@ -296,7 +297,7 @@ class EstimatorNode:
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
         fragment = estimator.state.fragment_of(odometry.frame_id)
         yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict, fragment) for verdict in verdicts)
-        no_new_view = Verdict.STALLED in (odometry.verdict, result.verdict) or odometry.verdict is Verdict.BAD_IMAGE
+        no_new_view = odometry.verdict in NO_NEW_VIEW or result.verdict is Verdict.STALLED
         if not no_new_view and not self._awaits_telemetry(odometry.t_ns, frame.attitude, estimator):
             yield self._prediction(odometry.t_ns, result, estimator, follows=follows)
             self._predicted_id = odometry.frame_id

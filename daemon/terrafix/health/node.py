@@ -8,6 +8,7 @@ from terrafix.core.errors import ConfigError
 from terrafix.core.node import Edge, NodeContext
 from terrafix.health.power import clock_limit, whole_computer_w
 from terrafix.health.sysfs import HealthEdge
+from terrafix.health.zones import DecidingZones
 from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, ThermalReading
 
 _RANK = {ThermalBand.NORMAL: 0, ThermalBand.HOT: 1, ThermalBand.CRITICAL: 2}
@@ -28,6 +29,7 @@ class HealthNode:
                 " raise critical_c"
             )
         self._settings = settings
+        self._zones = DecidingZones(settings.zones)
         self._by_temperature = ThermalBand.NORMAL
 
     def on(self, message: Message) -> Iterable[Message]:
@@ -39,8 +41,10 @@ class HealthNode:
 
     def _health(self, reading: ThermalReading) -> Health:
         """Band by temperature; at least HOT while a processor is throttled."""
-        hottest = max(reading.zones, key=lambda zone: zone.temperature_c, default=None)
+        zones, left_out = self._zones.of(reading)
+        hottest = max(zones, key=lambda zone: zone.temperature_c, default=None)
         self._by_temperature, cause = self._band(hottest)
+        cause = "; ".join([cause, *left_out])
         band = self._by_temperature
         if reading.throttling and band is ThermalBand.NORMAL:
             band = ThermalBand.HOT
@@ -60,7 +64,8 @@ class HealthNode:
     def _band(self, hottest: TemperatureZone | None) -> tuple[ThermalBand, str]:
         """-> (band by temperature, its cause in words)."""
         if hottest is None:
-            return ThermalBand.NORMAL, "no temperature zone is readable: taken for normal"
+            which = "zone of [health] zones" if self._settings.zones else "temperature zone"
+            return ThermalBand.NORMAL, f"no {which} is readable: taken for normal"
         limits = ((ThermalBand.CRITICAL, self._settings.critical_c), (ThermalBand.HOT, self._settings.hot_c))
         for band, enter_c in limits:
             leave_c = enter_c - self._settings.hysteresis_c
@@ -68,7 +73,8 @@ class HealthNode:
             temperature_c = hottest.temperature_c
             if temperature_c >= enter_c or (inside and temperature_c > leave_c):
                 return band, f"{hottest.name} {temperature_c:.1f} C; {band} from {enter_c:g} C down to {leave_c:g} C"
-        return ThermalBand.NORMAL, f"{hottest.name} {hottest.temperature_c:.1f} C is the hottest zone"
+        among = " of [health] zones" if self._settings.zones else ""
+        return ThermalBand.NORMAL, f"{hottest.name} {hottest.temperature_c:.1f} C is the hottest zone{among}"
 
 
 def make_node(ctx: NodeContext) -> HealthNode:

@@ -17,6 +17,11 @@ NVPMODEL_MODES = Path("/etc/nvpmodel.conf")  # "< POWER_MODEL ID=2 NAME=15W >"
 WHOLE_COMPUTER_RAILS = ("VDD_IN", "POM_5V_IN", "5V_IN")
 
 
+# Channels of an INA3221 with a bus voltage; in4 to in6 are the voltages at their shunts, in7 and curr4 the sums of all.
+# [spec: docs.kernel.org/hwmon/ina3221.html]
+INA3221, INA3221_CHANNELS = "ina3221", 3
+
+
 def read_clocks(sysfs: Path) -> list[ProcessorClock]:
     """All CPU policies, then all devfreq devices, of the mount point ``sysfs``."""
     cpus = (sysfs / "devices" / "system" / "cpu" / "cpufreq").glob("policy*")
@@ -34,14 +39,19 @@ def clock_limit(clocks: list[ProcessorClock]) -> float | None:
 
 
 def read_rails(hwmon: Path) -> list[PowerRail]:
-    """Channels with a power, or with a voltage and a current. ``hwmon``: sysfs folder class/hwmon."""
+    """Channels with a power, or else with a bus voltage and a current. ``hwmon``: sysfs folder class/hwmon."""
     rails = []
     for device in sorted(hwmon.glob("hwmon*")):
+        measured = set()
         for number in _channels(device, "power"):
             microwatts = read_number(device / f"power{number}_input")
             if microwatts is not None:
+                measured.add(number)
                 rails.append(PowerRail(name=_label(device, f"power{number}"), power_w=microwatts / 1e6))
+        is_ina3221 = read_text(device / "name") == INA3221
         for number in _channels(device, "curr"):
+            if number in measured or (is_ina3221 and number > INA3221_CHANNELS):
+                continue
             millivolts, milliamperes = (read_number(device / f"{kind}{number}_input") for kind in ("in", "curr"))
             if millivolts is not None and milliamperes is not None:
                 rails.append(PowerRail(name=_label(device, f"in{number}"), power_w=millivolts * milliamperes / 1e6))

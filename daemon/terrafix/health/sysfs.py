@@ -4,6 +4,7 @@ Files: https://docs.kernel.org/driver-api/thermal/sysfs-api.html (temperatures i
 A sensor that cannot be read is left out (on a Jetson the zones of powered-down units return EAGAIN)."""
 
 import shutil
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -67,15 +68,20 @@ class HealthEdge:
 
 
 def read_zones(thermal: Path) -> list[TemperatureZone]:
-    """All zones with a plausible temperature. ``thermal``: sysfs folder class/thermal."""
+    """All zones with a plausible temperature, each with a name of its own: its type, and its folder where another zone
+    has that type, too. ``thermal``: sysfs folder class/thermal."""
+    folders = sorted(thermal.glob("thermal_zone*"))
+    kinds = {folder: read_text(folder / "type") or folder.name for folder in folders}
+    uses = Counter(kinds.values())
     zones = []
-    for folder in sorted(thermal.glob("thermal_zone*")):
+    for folder in folders:
         millidegrees = read_number(folder / "temp")
         if millidegrees is None:
             continue
         temperature_c = millidegrees / 1000
         if PLAUSIBLE_C[0] < temperature_c < PLAUSIBLE_C[1]:
-            zones.append(TemperatureZone(name=read_text(folder / "type") or folder.name, temperature_c=temperature_c))
+            name = kinds[folder] if uses[kinds[folder]] == 1 else f"{kinds[folder]} ({folder.name})"
+            zones.append(TemperatureZone(name=name, temperature_c=temperature_c))
     return zones
 
 

@@ -340,7 +340,7 @@ class MavlinkEdge:
             for packet in self._outputs.messages(gps, self._autopilot.snapshot(gps.t_ns)):
                 self._send(packet)
         for output in self._serial_outputs:
-            output.send(gps, gps.t_ns)
+            output.send(gps, gps.t_ns, self._autopilot.firmware)
         connected = self._autopilot.telemetry.connected(gps.t_ns)
         for value in self._named_values.messages(gps) if connected or len(self._ground) else ():
             if connected:

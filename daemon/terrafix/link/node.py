@@ -21,10 +21,12 @@ from terrafix.link.output import gps_report
 from terrafix.link.output.gps_time import LatchedClock
 from terrafix.link.output.send_schedule import SendSchedule
 from terrafix.link.pilot_text.debounce import Debounce
+from terrafix.link.pilot_text.frame_load import FrameLoad
 from terrafix.link.pilot_text.statustext import CRITICAL, INFO, NOTICE, WARNING, fault_text, statustext
 from terrafix.messages import (
     CalibrationFault,
     EkfStatus,
+    Frame,
     GnssReading,
     GpsInput,
     Health,
@@ -93,6 +95,7 @@ class LinkNode:
         self._gnss = GnssMonitor(gnss, map_offsets, on_vision=on_vision)
         self._starts = GnssInitializer(enabled=gnss_start)
         self._prior_request = PriorRequest()
+        self._frame_load = FrameLoad()
         self._ekf_monitor = EkfStatusMonitor()
         self._candidates: list[int] = []  # of ServedVehicle
         self._armed: bool | None = None
@@ -114,6 +117,7 @@ class LinkNode:
         self._level_debounce.reported = 0
         self._highest_level = 0  # highest degradation level since the last map fix
         self._handlers: dict[type, Callable[[Any], list[Message]]] = {
+            Frame: self._on_frame,
             NavEstimate: self._on_estimate,
             VehicleState: self._on_vehicle_state,
             Imu: self._on_imu,
@@ -137,6 +141,9 @@ class LinkNode:
     def tick(self, now_ns: int) -> Iterable[Message]:
         self._now_ns = now_ns
         return self._send(now_ns) if self._schedule.due(now_ns) else ()
+
+    def _on_frame(self, frame: Frame) -> list[Message]:
+        return [*self._frame_load.on_frame(frame)]
 
     def _on_estimate(self, estimate: NavEstimate) -> list[Message]:
         now_ns = max(self._now_ns, estimate.emitted_at_ns)  # the last tick may be older than the estimate

@@ -5,6 +5,7 @@ import platform
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,10 @@ _MAP_KEYS = ("name", "checksum", "date", "source", "built_with")
 _DEVICE_NAMES = ("/proc/device-tree/model", "/sys/class/dmi/id/product_name")
 
 
-def header(config: Config, map_path: Path | None = None) -> dict[str, str]:
+def header(config: Config, map_path: Path | None = None, facts: Sequence[tuple[str, str]] = ()) -> dict[str, str]:
     """Header of every file of a record. The camera of the flight is in its Origin, and repeated as `calibration`.
 
-    ``map_path``: map package; None: there is none."""
+    ``map_path``: map package; None: there is none. ``facts``: what the source says of itself, by topic."""
     parts = {
         "config": config,
         "versions": versions(),
@@ -37,7 +38,7 @@ def header(config: Config, map_path: Path | None = None) -> dict[str, str]:
         "models": models_of(config.models),
         "device": device(),
     }
-    return _encoded(parts)
+    return _encoded({**parts, "source": [list(fact) for fact in facts]} if facts else parts)
 
 
 def copied_header(found: dict[str, Any], **changed: Any) -> dict[str, str]:

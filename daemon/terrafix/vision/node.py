@@ -79,7 +79,7 @@ class VisionNode:
             self._model_event = None
         self._busy = self._busy or frame.error == OVERTAKEN
         if image is None or self._tracker is None or self._search is None:
-            yield _without_motion(frame, Verdict.BAD_IMAGE)
+            yield _without_motion(frame, Verdict.OVERTAKEN if frame.error == OVERTAKEN else Verdict.BAD_IMAGE)
             return
         gray = self._tracker.working_copy(image)
         repeat = self._history.classify(gray)

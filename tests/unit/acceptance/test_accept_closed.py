@@ -20,10 +20,11 @@ from terrafix_lab.accept.false_inputs import scenarios
 from terrafix_lab.accept.false_inputs.scenarios import LIES_IN_THE_LOOP
 from terrafix_lab.accept.measuring.criteria import judge
 from terrafix_lab.accept.measuring.evidence import Evidence, SentFix
-from terrafix_lab.accept.measuring.results import Marks, Span, Verdict
+from terrafix_lab.accept.measuring.results import Marks, Verdict
 from terrafix_lab.accept.plan import CLOSED_LOOP
 from terrafix_lab.accept.run import QUICK_LEAVES_OUT
 from terrafix_lab.accept.scenarios import BY_NAME
+from terrafix_lab.faults.edits import Span
 from terrafix_lab.sim.closed_loop.loop import TRACK_COLUMNS
 from terrafix_lab.sim.interfaces import State
 

@@ -14,14 +14,15 @@ from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, Frame, Health, MapMatch, Message, Origin, Prediction, VehicleState, Verdict
 from terrafix.vision.sources import Shot
-from terrafix_lab.accept.false_inputs import inputs as lying
 from terrafix_lab.accept.false_inputs.maps import stale_along
-from terrafix_lab.accept.faults import flight_edits
-from terrafix_lab.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
 from terrafix_lab.accept.flight import Flight, FrameRef, read_any_truth
-from terrafix_lab.accept.measuring.results import Span
+from terrafix_lab.accept.long_route import ThereAndBack, original
 from terrafix_lab.accept.plan import Plan
 from terrafix_lab.accept.scenarios import BY_NAME
+from terrafix_lab.faults import edits, pictures
+from terrafix_lab.faults.edits import Span
+from terrafix_lab.faults.nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_lab.faults.source import AlteredSource
 from terrafix_tools.evaluate import Truth
 
 CAMERA = Camera(width=8, height=4, fx=8.0, fy=8.0, cx=3.5, cy=1.5)
@@ -61,8 +62,8 @@ class Counting:
         pass
 
 
-def altered(edit: flight_edits.Edit, **more: object) -> list[Shot]:
-    source = flight_edits.AlteredSource(Counting(), edit, origin=flight_edits.unchanged_origin, **more)  # type: ignore[arg-type]
+def altered(edit: edits.Edit, **more: object) -> list[Shot]:
+    source = AlteredSource(Counting(), edit, **more)  # type: ignore[arg-type]
     return list(source.shots())
 
 
@@ -76,7 +77,7 @@ def grey(shot: Shot) -> int:
 
 
 def test_an_altered_source_limits_and_renumbers_frames() -> None:
-    shots = altered(flight_edits.without_frames(frozenset({"1.jpg", "2.jpg"})), frames=6)
+    shots = altered(edits.without_frames(frozenset({"1.jpg", "2.jpg"})), frames=6)
     assert files(shots) == ["0.jpg", "3.jpg", "4.jpg", "5.jpg"]
     assert [s.frame.frame_id for s in shots] == [0, 1, 2, 3]
     assert [len(s.states) for s in shots] == [1, 3, 1, 1]  # telemetry continues
@@ -84,30 +85,30 @@ def test_an_altered_source_limits_and_renumbers_frames() -> None:
 
 def test_a_foreign_frame_is_inserted_between_two_others() -> None:
     stranger = np.full((4, 8, 3), 99, np.uint8)
-    shots = altered(flight_edits.foreign_frames({"5.jpg": stranger}))
+    shots = altered(edits.foreign_frames({"5.jpg": stranger}))
     assert len(shots) == FRAMES + 1
     foreign = shots[5]
-    assert foreign.frame.file == flight_edits.foreign_name("5.jpg") and shots[6].frame.file == "5.jpg"
+    assert foreign.frame.file == edits.foreign_name("5.jpg") and shots[6].frame.file == "5.jpg"
     assert shots[4].frame.t_ns < foreign.frame.t_ns < shots[6].frame.t_ns
     assert foreign.image is stranger and foreign.states == ()
 
 
 def test_black_and_frozen_pictures() -> None:
     span = Span(3.0, 5.0, "")
-    assert [grey(s) for s in altered(lying.black(span))] == [1, 2, 3, 0, 0, 0, *range(7, 13)]
-    assert [grey(s) for s in altered(lying.frozen(span))] == [1, 2, 3, 3, 3, 3, *range(7, 13)]
+    assert [grey(s) for s in altered(pictures.black(span))] == [1, 2, 3, 0, 0, 0, *range(7, 13)]
+    assert [grey(s) for s in altered(pictures.frozen(span))] == [1, 2, 3, 3, 3, 3, *range(7, 13)]
 
 
 def test_edits_of_telemetry() -> None:
-    assert altered(flight_edits.height_times(1.1))[5].states[0].agl_m == pytest.approx(115.5)
-    turned = altered(flight_edits.yaw_plus(15.0))[0].states[0].yaw_rad
+    assert altered(edits.telemetry(edits.height_times(1.1)))[5].states[0].agl_m == pytest.approx(115.5)
+    turned = altered(edits.telemetry(edits.turned(15.0)))[0].states[0].yaw_rad
     assert turned is not None and np.degrees(turned) == pytest.approx(np.degrees(3.0) + 15.0 - 360.0)
-    unknown = altered(flight_edits.yaw_unknown())[0].states[0]
+    unknown = altered(edits.telemetry(edits.yaw_unknown))[0].states[0]
     assert unknown.yaw_rad is None and unknown.agl_m == 100.0
 
 
 def test_a_moved_start_keeps_its_stated_sigma() -> None:
-    moved = flight_edits.start_moved(700.0, -300.0)(ORIGIN)
+    moved = edits.start_moved(700.0, -300.0)(ORIGIN)
     east_m, north_m = LocalFrame(48.0, 11.0).to_local(moved.lat_deg, moved.lon_deg)
     assert (east_m, north_m) == pytest.approx((700.0, -300.0), abs=0.01)
     assert moved.start_sigma_m == ORIGIN.start_sigma_m
@@ -115,14 +116,12 @@ def test_a_moved_start_keeps_its_stated_sigma() -> None:
 
 def test_a_long_route_is_the_flight_forwards_and_backwards() -> None:
     states = [shot.states[0] for shot in Counting().shots()]
-    source = flight_edits.ThereAndBack(
-        Counting(), [FrameRef(f"{i}.jpg", float(i), s) for i, s in enumerate(states)], 30
-    )
+    source = ThereAndBack(Counting(), [FrameRef(f"{i}.jpg", float(i), s) for i, s in enumerate(states)], 30)
     shots = list(source.shots())
     assert [grey(s) for s in shots[9:14]] == [10, 11, 12, 11, 10]  # reverses at the last frame
     times = [s.frame.t_ns for s in shots]
     assert len(shots) == 30 and times == [i * 10**9 for i in range(30)]
-    assert len(set(files(shots))) == 30 and flight_edits.original(files(shots)[11:13]) == ["11.jpg", "10.jpg"]
+    assert len(set(files(shots))) == 30 and original(files(shots)[11:13]) == ["11.jpg", "10.jpg"]
     assert all(s.states[0].t_ns == s.frame.t_ns for s in shots)
     assert [s.states[0].agl_m for s in shots[10:13]] == [110.0, 111.0, 110.0]
 

@@ -9,8 +9,9 @@ from accept_case import STEP_S, FrameCase, evidence
 from terrafix_lab.accept.false_inputs import integrity as of
 from terrafix_lab.accept.fly import Result
 from terrafix_lab.accept.measuring.criteria import judge
-from terrafix_lab.accept.measuring.results import Marks, Span, Verdict
+from terrafix_lab.accept.measuring.results import Marks, Verdict
 from terrafix_lab.accept.table import conclude
+from terrafix_lab.faults.edits import Span
 
 GOOD = FrameCase()
 FALSE = FrameCase(error_m=80.0)

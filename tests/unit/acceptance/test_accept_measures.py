@@ -15,7 +15,8 @@ from terrafix.messages import CovarianceMode, Odometry, SourceLabel
 from terrafix.messages import Verdict as Answer
 from terrafix_lab.accept.measuring import measures as of
 from terrafix_lab.accept.measuring.criteria import CRITERIA, judge
-from terrafix_lab.accept.measuring.results import Bounds, JudgedRow, Marks, Span, Verdict, with_unit
+from terrafix_lab.accept.measuring.results import Bounds, JudgedRow, Marks, Verdict, with_unit
+from terrafix_lab.faults.edits import Span
 
 GOOD = FrameCase()
 LOST = FrameCase(

@@ -15,14 +15,14 @@ from terrafix.estimator.filter_state import FrameInput
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Imu
 from terrafix_lab.bench.growth import estimator_cost, map_size
-from terrafix_lab.bench.growth.stream import FIX_EVERY, FRAME_S, LEG_S, ORIGIN, frame_messages
+from terrafix_lab.bench.growth.stream import FIX_EVERY, FRAME_S, frame_messages, origin
 
 
 def test_the_estimator_follows_the_synthetic_flight() -> None:
-    """Until after the first turn. The messages must describe one motion, or the benchmark would time a lost
+    """The messages must describe one motion, or the benchmark would time a lost
     estimator."""
-    estimator, telemetry = Estimator(ORIGIN), Telemetry()
-    frames, rejected, inertial = round((LEG_S + 10.0) / FRAME_S), 0, 0
+    estimator, telemetry = Estimator(origin()), Telemetry()
+    frames, rejected, inertial = 140, 0, 0
     for frame in frame_messages(frames):
         for message in frame.telemetry:
             (telemetry.add_imu if isinstance(message, Imu) else telemetry.add)(message)  # type: ignore[operator]
@@ -52,7 +52,7 @@ def allocated_bytes() -> int:
 def test_what_the_estimator_keeps_of_each_frame_is_small() -> None:
     """In Python and in GTSAM, while the history retains more and more nodes: 2 kB a frame, and 44 kB if factors were
     parts of larger matrices. A window has some 40 factors more or less, 10 kB each."""
-    estimator, used = Estimator(ORIGIN), []
+    estimator, used = Estimator(origin()), []
     for frame, _ in enumerate(estimator_cost._flown(estimator, 300)):
         if frame in (99, 299):
             gc.collect()

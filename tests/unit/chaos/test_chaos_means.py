@@ -17,20 +17,20 @@ from terrafix.core.errors import OutputError, SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix_lab.chaos import rig
 from terrafix_lab.chaos.camera import camera_toml
-from terrafix_lab.chaos.faults import FAULTS
 from terrafix_lab.chaos.memory_group import V1, V2, MemoryGroup
 from terrafix_lab.chaos.recorded_scene import recorded_scene
-from terrafix_lab.chaos.rig import Need
 from terrafix_lab.chaos.run import fly_cell, missing_here
-from terrafix_lab.chaos.scene import Phase, Scene
+from terrafix_lab.chaos.scene import Scene
 from terrafix_lab.chaos.serial_line import SerialLine
 from terrafix_lab.chaos.switches import Switch, Switches
 from terrafix_lab.chaos.verdict import sigmas
+from terrafix_lab.faults.fault import Fault, Need, Phase
+from terrafix_lab.faults.table import FAULTS
 from terrafix_lab.sim.autopilot.report import ReceivedFix
 
 
-def fault(name: str):  # type: ignore[no-untyped-def]
-    return next(one for one in FAULTS if one.name == name)
+def fault(name: str) -> Fault:
+    return FAULTS[name]
 
 
 @pytest.mark.real_time
@@ -129,10 +129,11 @@ def test_the_control_group_of_memory_is_that_of_the_kernels_version(tmp_path: Pa
 def test_a_leak_names_its_process_and_ends_with_its_limit(tmp_path: Path) -> None:
     rig = StubRig(tmp_path / "switches")
     leak = fault("anchor: leak")
-    leak.begin(rig)  # type: ignore[arg-type]
+    assert leak.process is not None
+    leak.process.begin(rig)  # type: ignore[arg-type]
     assert (tmp_path / "switches" / Switch.LEAK_PID).read_text() == "77"
     assert rig.memory_group.calls == [(77, 128 << 20)]
-    leak.end(rig)  # type: ignore[arg-type]
+    leak.process.end(rig)  # type: ignore[arg-type]
     assert not list((tmp_path / "switches").iterdir()) and rig.memory_group.calls[1:] == ["lifted"]
 
 
@@ -173,9 +174,10 @@ def test_a_switched_fault_begins_and_ends(tmp_path: Path) -> None:
     jump = fault("wall clock: a year back")
     stub = StubRig(tmp_path)
     assert Need.SWITCHES in jump.needs
-    jump.begin(stub)
+    assert jump.process is not None
+    jump.process.begin(stub)
     assert float((tmp_path / Switch.WALL_CLOCK_S).read_text()) == -365 * 86_400.0
-    jump.end(stub)
+    jump.process.end(stub)
     assert not list(tmp_path.iterdir())
 
 
@@ -239,4 +241,4 @@ def test_a_flight_without_an_even_rate_is_refused(tmp_path: Path) -> None:
 
 def test_a_fix_is_not_expected_where_the_fault_leaves_no_way_to_one() -> None:
     assert fault("map: file removed").no_fix_in == {Phase.START, Phase.LANDING}
-    assert {one.name for one in FAULTS if one.no_fix_in != {Phase.LANDING}} == {"map: file removed"}
+    assert {one.name for one in FAULTS.values() if one.no_fix_in != {Phase.LANDING}} == {"map: file removed"}

@@ -7,14 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from terrafix.core.errors import OutputError, SourceError
+from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix_lab.chaos import verdict
-from terrafix_lab.chaos.camera import Look, StreamedCamera, altered
-from terrafix_lab.chaos.faults import FAULTS
+from terrafix_lab.chaos.camera import StreamedCamera
 from terrafix_lab.chaos.run import Results
-from terrafix_lab.chaos.scene import AGL_M, Phase, phases
+from terrafix_lab.chaos.scene import AGL_M, phases
 from terrafix_lab.chaos.table import table, write_table
 from terrafix_lab.chaos.verdict import Outcome
+from terrafix_lab.faults.edits import Span
+from terrafix_lab.faults.fault import CAMPAIGNS, Phase, check_flown_by, lacking
+from terrafix_lab.faults.table import FAULTS, MATRIX
 from terrafix_lab.sim.autopilot.course import PeerState
 from terrafix_lab.sim.autopilot.report import ReceivedFix
 from terrafix_lab.sim.camera.stream import FrameStream
@@ -75,25 +77,25 @@ def test_a_fix_is_not_expected_after_a_fault_in_the_landing_and_no_record_where_
 
 
 def test_the_faults_have_names_of_their_own() -> None:
-    assert len({fault.name for fault in FAULTS}) == len(FAULTS) > 40
+    assert len({fault.name for fault in MATRIX}) == len(MATRIX) > 40
 
 
 def test_an_interrupted_matrix_goes_on_where_it_was(tmp_path: Path) -> None:
     results = Results(tmp_path / "results.json")
-    assert not results.has(FAULTS[1], Phase.CRUISE)
-    results.add(Outcome(fault=FAULTS[1].name, phase=Phase.CRUISE, verdict="ok", silence_s=2.5, back_s=4.0))
-    results.add(Outcome(fault=FAULTS[1].name, phase=Phase.CRUISE, verdict="ok", silence_s=1.5, back_s=3.0, fixes=7))
+    assert not results.has(MATRIX[1], Phase.CRUISE)
+    results.add(Outcome(fault=MATRIX[1].name, phase=Phase.CRUISE, verdict="ok", silence_s=2.5, back_s=4.0))
+    results.add(Outcome(fault=MATRIX[1].name, phase=Phase.CRUISE, verdict="ok", silence_s=1.5, back_s=3.0, fixes=7))
     again = Results(tmp_path / "results.json")
-    assert again.has(FAULTS[1], Phase.CRUISE) and not again.has(FAULTS[1], Phase.TURN)
+    assert again.has(MATRIX[1], Phase.CRUISE) and not again.has(MATRIX[1], Phase.TURN)
     assert [outcome.silence_s for outcome in again.outcomes] == [1.5]
 
 
 def test_commands_that_fly_parts_of_one_matrix_keep_each_others_outcomes(tmp_path: Path) -> None:
     one, other = Results(tmp_path / "results.json"), Results(tmp_path / "results.json")
-    one.add(Outcome(fault=FAULTS[1].name, phase=Phase.CRUISE, verdict="ok"))
-    other.add(Outcome(fault=FAULTS[1].name, phase=Phase.TURN, verdict="ok"))
+    one.add(Outcome(fault=MATRIX[1].name, phase=Phase.CRUISE, verdict="ok"))
+    other.add(Outcome(fault=MATRIX[1].name, phase=Phase.TURN, verdict="ok"))
     assert [o.phase for o in Results(tmp_path / "results.json").outcomes] == [Phase.CRUISE, Phase.TURN]
-    assert other.has(FAULTS[1], Phase.CRUISE)
+    assert other.has(MATRIX[1], Phase.CRUISE)
 
 
 def test_results_that_cannot_be_read_or_written_are_named(tmp_path: Path) -> None:
@@ -133,7 +135,7 @@ def test_a_cell_whose_flight_failed_before_the_fault_is_none_of_the_table_and_is
     assert "| none | - |\n" in table([failed]) and "0 cells with 0 positions" in table([failed])
     results = Results(tmp_path / "results.json")
     results.add(failed)
-    assert not results.has(FAULTS[0], Phase.CRUISE)
+    assert not results.has(MATRIX[0], Phase.CRUISE)
 
 
 def jpeg() -> bytes:
@@ -143,17 +145,6 @@ def jpeg() -> bytes:
 
 def decoded(data: bytes) -> np.ndarray | None:
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-
-
-def test_the_camera_shows_what_its_fault_says() -> None:
-    good = jpeg()
-    image, black, white, blurred, small = (
-        decoded(altered(good, look)) for look in (Look.GOOD, Look.BLACK, Look.OVEREXPOSED, Look.DEFOCUSED, Look.SMALL)
-    )
-    assert image is not None and black is not None and white is not None and blurred is not None and small is not None
-    assert black.max() == 0 and np.median(white) == 255 and small.shape == (45, 80, 3)
-    assert blurred.std() < 0.4 * image.std()
-    assert decoded(altered(good, Look.TORN)) is None
 
 
 def copter(t_s: float) -> PeerState:
@@ -192,3 +183,55 @@ def test_each_image_is_stamped_with_its_own_time_whatever_the_phase_of_the_fligh
     for image, t_ns in stream.pushed:
         assert t_ns / 1e9 - began_s == pytest.approx(float(image), abs=0.002)
         assert float(image) * 2.0 == round(float(image) * 2.0)
+
+
+@pytest.mark.real_time
+def test_the_live_camera_shows_what_its_fault_says() -> None:
+    good, black, white, blurred, small, torn = (
+        jpeg(),
+        *(
+            sent(f"camera: {name}")[-1][0]
+            for name in ("black", "overexposed", "defocused", "wrong resolution", "no JPEG")
+        ),
+    )
+    images = [decoded(data) for data in (good, black, white, blurred, small)]
+    assert all(image is not None for image in images)
+    assert images[1].max() == 0 and np.median(images[2]) == 255 and images[4].shape == (45, 80, 3)  # type: ignore[union-attr]
+    assert images[3].std() < 0.4 * images[0].std()  # type: ignore[union-attr]
+    assert decoded(torn) is None
+    assert not sent("camera: unplugged")
+    assert {data for data, _ in sent("none")} == {good}, "without a fault the bytes of the flight themselves"
+
+
+@pytest.mark.real_time
+def test_the_live_camera_sends_other_times_and_each_image_ten_times() -> None:
+    for name, off_s in (("camera: stamps 5 s ahead", 5.0), ("camera: stamps 3 s late", -3.0)):
+        now_ns = time.monotonic_ns()
+        assert (sent(name)[0][1] - now_ns) / 1e9 == pytest.approx(off_s, abs=0.8), name
+    stamps = [t_ns for _, t_ns in sent("camera: each image ten times")]
+    assert len(stamps) > 10 and len(set(stamps)) <= len(stamps) / 5
+
+
+def sent(name: str) -> list[tuple[bytes, int]]:
+    """Images and stamps of 0.5 s of a camera of 10 Hz with the fault."""
+    began_s = time.monotonic()
+    with (
+        Recorded() as stream,
+        StreamedCamera(stream, lambda _t_s: jpeg(), lambda: time.monotonic() - began_s, 10.0) as camera,
+    ):
+        camera.edit = FAULTS[name].edit(Span(0.0, 1e9, name))
+        time.sleep(0.15)
+        stream.pushed.clear()
+        time.sleep(0.5)
+        return list(stream.pushed)
+
+
+def test_a_campaign_that_lacks_what_a_fault_needs_says_so_and_names_one_that_has_it() -> None:
+    with pytest.raises(UsageError, match=r"'disk: full': the fault needs .* fly it by terrafix chaos --fault$"):
+        check_flown_by("terrafix montecarlo --fault", FAULTS["disk: full"])
+    with pytest.raises(UsageError, match=r"needs images, .* terrafix accept --scenario or terrafix chaos --fault$"):
+        check_flown_by("terrafix montecarlo --fault", FAULTS["half the picture stands still"])
+    for fault in FAULTS.values():
+        able = [command for command in CAMPAIGNS if not lacking(command, fault)]
+        assert able, f"nothing can fly '{fault.name}'"
+        assert fault.process is None or able == ["terrafix chaos --fault"]

@@ -10,8 +10,8 @@ import pytest
 from recorded_flight import blind_between, errors, messages, record, replayed_graph, seen_again
 from simulated_flight import Flight, t_ns
 from terrafix.messages import Frame, MapMatch, Message, Refinement, SourceEnded
+from terrafix_tools.before_after import kept_line
 from terrafix_tools.finalise.batch_smoother import smooth
-from terrafix_tools.finalise.before_after import kept_line
 from terrafix_tools.finalise.flight_graph import HELD_OUT_RUN, FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, Comparison, choose
 from terrafix_tools.finalise.run import finalise, last_lines

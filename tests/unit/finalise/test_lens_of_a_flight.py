@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from terrafix_lab.bench import finalised
-from terrafix_tools.finalise.before_after import Change
-from terrafix_tools.finalise.output import read_flights
+from terrafix_tools.before_after import Change
+from terrafix_tools.finalised import read_flights
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.sections_run import finalised as section
 

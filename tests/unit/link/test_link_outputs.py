@@ -273,6 +273,41 @@ def test_msp_frame_field_by_field() -> None:
     }
 
 
+def test_accuracies_of_msp_are_as_the_firmware_that_is_heard_reads_them() -> None:
+    """iNav divides by 10 and has centimetres (src/main/io/gps_msp.c), ArduPilot multiplies by 0.01 (AP_GPS_MSP.cpp)."""
+    inav, ardupilot = (SensorGps.from_buffer_copy(f(GPS)[8:-1]) for f in (msp.inav_frame, msp.frame))
+    assert (inav.horizontalPosAccuracy // 10, inav.verticalPosAccuracy // 10) == (650, 450)  # its eph and epv, cm
+    assert ardupilot.horizontalPosAccuracy * 0.01 == pytest.approx(GPS.horiz_accuracy_m)
+    differing = {name for name, _ in SensorGps._fields_ if getattr(inav, name) != getattr(ardupilot, name)}
+    assert differing == {"horizontalPosAccuracy", "verticalPosAccuracy"}
+    huge = SensorGps.from_buffer_copy(msp.inav_frame(msgspec.structs.replace(GPS, horiz_accuracy_m=1000.0))[8:-1])
+    assert huge.horizontalPosAccuracy == 65_535
+    master, slave = pty.openpty()
+    link = WiredEdge(msp_device=os.ttyname(slave))
+    link.receives(0, heartbeat())
+    link.edge.on_message(GPS)
+    time.sleep(0.01)
+    assert os.read(master, 4096) == msp.frame(GPS)
+    link.edge.close()
+
+
+@pytest.mark.parametrize(
+    ("north_mps", "east_mps", "course"),
+    [
+        (10.0, -1e-9, "0.00"),
+        (10.0, -8e-4, "0.00"),
+        (10.0, -2e-3, "359.99"),
+        (10.0, 0.0, "0.00"),
+        (0.0, -10.0, "270.00"),
+        (-10.0, -1e-9, "180.00"),
+    ],
+)
+def test_the_nmea_course_is_below_360(north_mps: float, east_mps: float, course: str) -> None:
+    moving = msgspec.structs.replace(GPS, vn_mps=north_mps, ve_mps=east_mps)
+    rmc = next(line for line in nmea.sentences(moving).decode().split("\r\n") if line[3:6] == "RMC")
+    assert rmc.split(",")[8] == course
+
+
 def test_msp_without_fix_and_clock() -> None:
     read = SensorGps.from_buffer_copy(msp.frame(NO_FIX)[8:-1])
     assert (read.gpsWeek, read.fixType, read.satellitesInView, read.year) == (0xFFFF, 1, 0, 0)
@@ -379,13 +414,13 @@ def test_nmea_and_msp_are_sent_on_their_own_devices_and_one_may_be_lost() -> Non
     link.edge.on_message(GPS)
     time.sleep(0.01)
     assert os.read(masters[0], 4096) == nmea.sentences(GPS)
-    assert os.read(masters[1], 4096) == msp.frame(GPS)
+    assert os.read(masters[1], 4096) == msp.inav_frame(GPS)  # no ArduPilot is heard
     os.close(masters[0])
     link.edge.on_message(GPS)
     link.poll(0)
     assert f"{names[0]}: connection lost" in link.status().detail
     time.sleep(0.01)
-    assert os.read(masters[1], 4096) == msp.frame(GPS)
+    assert os.read(masters[1], 4096) == msp.inav_frame(GPS)  # no ArduPilot is heard
     link.edge.close()
     os.close(masters[1])
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+import input_table
 import project_tables
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -74,6 +75,17 @@ def test_the_architecture_page_is_short() -> None:
 def test_the_architecture_page_has_the_generated_tables() -> None:
     text = project_tables.PAGE.read_text(encoding="utf-8")
     assert text == project_tables.page(text), "run: .venv/bin/python tests/rigs/project_tables.py"
+
+
+def test_the_page_of_inputs_has_the_generated_tables_and_every_row_names_tests_that_exist() -> None:
+    text = input_table.PAGE.read_text(encoding="utf-8")
+    assert text == input_table.page(text), "run: .venv/bin/python tests/rigs/input_table.py"
+    for row in (row for rows in input_table.TABLES.values() for row in rows):
+        file, names = row.tests
+        source = (ROOT / "tests" / "unit" / file).read_text(encoding="utf-8")
+        assert names, f"{row.quantity}: no test holds this row"
+        for name in names:
+            assert f"def {name}(" in source, f"{row.quantity}: {file} has no {name}"
 
 
 def test_files_named_on_the_architecture_page_exist() -> None:

@@ -15,14 +15,17 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import terrafix
+from terrafix.core.errors import MapError
 
 ROOT = Path(__file__).resolve().parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+GROUND = tomllib.loads((ROOT / "tools" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 CORE = {canonicalize_name(Requirement(r).name): Requirement(r) for r in PROJECT["dependencies"]}
-EXTRAS = {
-    extra: {canonicalize_name(Requirement(r).name): Requirement(r) for r in requirements}
+EXTRAS = {  # libraries, without our own distribution for the ground
+    extra: {canonicalize_name(Requirement(r).name): Requirement(r) for r in requirements if GROUND["name"] not in r}
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
+WITHOUT_GROUND = {"vehicle", "faiss", "dev", "nightly"}  # what a vehicle may have, and the checks
 IMPORTED_AS = {
     "foxglove-schemas-protobuf": "foxglove_schemas_protobuf",
     "protobuf": "google",
@@ -39,6 +42,7 @@ EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 SEARCH = ROOT / "daemon" / "terrafix" / "anchor" / "place_index" / "faiss_ivf.py"  # the only file that imports FAISS
 SERVICE = ROOT / "daemon" / "terrafix" / "runtime" / "systemd.py"  # the only file that imports systemd-python
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools", "terrafix_lab"}
+SOURCES = ("daemon", "engines", "tools")
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 
@@ -137,7 +141,8 @@ def test_the_lock_file_names_no_host() -> None:
 
 def test_the_version_is_the_same_in_code_metadata_and_changelog() -> None:
     version = PROJECT["version"]
-    assert terrafix.__version__ == version
+    assert terrafix.__version__ == version == GROUND["version"]
+    assert GROUND["requires-python"] == PROJECT["requires-python"]
     assert metadata.version("terrafix") == version
     newest = re.search(r"^## \[([^\]]+)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.M)
     assert newest is not None and newest[1] == version
@@ -168,29 +173,114 @@ def test_without_gdal_a_map_package_is_enough_for_replay_run_and_report() -> Non
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def files_of_wheel(folder: Path, source: Path) -> set[str]:
+    """The wheel as the build backend assembles it from ``source``, unpacked in ``folder``; -> its files of code."""
+    builder = pytest.importorskip("hatchling.builders.wheel", reason="the build backend is not installed")
+    (wheel,) = builder.WheelBuilder(str(source)).build(directory=str(folder.parent), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+        return {name for name in archive.namelist() if name.split("/")[0] in OURS}
+
+
 @pytest.fixture(scope="module")
 def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel as the build backend assembles it, unpacked in a folder of its own."""
-    builder = pytest.importorskip("hatchling.builders.wheel", reason="the build backend is not installed")
-    folder = tmp_path_factory.mktemp("wheel")
-    (wheel,) = builder.WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder / "site")
-    return folder / "site"
+    """The wheel of a vehicle, in a folder of its own."""
+    folder = tmp_path_factory.mktemp("wheel") / "site"
+    files_of_wheel(folder, ROOT)
+    return folder
 
 
 def in_wheel(unpacked: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """A command of the unpacked wheel, outside the source tree, without GDAL."""
-    code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
+    """A command of the vehicle's wheel, outside the source tree, without GDAL and the lab of this checkout."""
+    code = "import sys; sys.modules.update(rasterio=None, terrafix_lab=None); "
+    code += "sys.argv[0] = 'terrafix'; from terrafix_tools.cli import main; main()"
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],
         capture_output=True,
         text=True,
         timeout=60,
         cwd=unpacked.parent,
-        env={**os.environ, "PYTHONPATH": str(unpacked)},
+        env={**os.environ, "PYTHONPATH": str(unpacked), "COLUMNS": "80"},
         check=False,
     )
+
+
+def test_each_file_of_the_packages_is_in_one_of_the_two_wheels(tmp_path: Path) -> None:
+    flying, ground = files_of_wheel(tmp_path / "a", ROOT), files_of_wheel(tmp_path / "b", ROOT / "tools")
+    assert not flying & ground
+    tracked = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", *SOURCES],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    written = {name.partition("/")[2] for name in tracked.stdout.split() if name.split("/")[1] in OURS}
+    both = {name for name in flying | ground if not name.startswith("terrafix/data/")}
+    assert both == written
+
+
+def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpacked: Path) -> None:
+    folders = {path.name for path in (unpacked / "terrafix_tools").iterdir()} | {
+        path.name for path in unpacked.iterdir()
+    }
+    assert not folders & {"terrafix_lab", "console", "fleet", "finalise", "compare", "locate", "parallel"}
+    assert not (unpacked / "terrafix_engines" / "train").exists()
+    shown = in_wheel(unpacked, "--help")
+    commands = [line.split()[1] for line in shown.stdout.splitlines() if re.match(r"│ [a-z]", line)]
+    assert commands == [
+        *("run", "replay", "evaluate", "report", "preflight", "status", "hint", "log", "source", "files", "models", "map")
+    ], shown.stderr
+    status = in_wheel(unpacked, "status", "--run", "nowhere")
+    assert status.returncode == 2 and status.stderr.startswith("terrafix: nowhere: no such folder; omit --run")
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        ("demo", "ground"),
+        ("finalise out/run", "ground"),
+        ("map build map.tif --out map.gpkg", "ground"),
+        ("models fetch xfeat", "ground"),
+        ("serve", "console"),
+    ],
+)
+def test_a_command_that_a_vehicle_does_not_have_says_what_to_install(unpacked: Path, words: str, extra: str) -> None:
+    done = in_wheel(unpacked, *words.split())
+    assert done.returncode == 2
+    assert done.stderr == f"terrafix: this command needs terrafix-ground; install it: pip install 'terrafix[{extra}]'\n"
+
+
+def test_a_geotiff_on_a_vehicle_is_one_line(unpacked: Path, tmp_path: Path) -> None:
+    (tmp_path / "map.tif").touch()
+    flight = ("--source", "/dev/video0", "--map", str(tmp_path / "map.tif"), "--out", str(tmp_path / "out"))
+    done = in_wheel(unpacked, "run", *flight)
+    assert done.returncode == MapError.exit_code
+    assert re.fullmatch(r"terrafix: \S+/map.tif: no map package .* pip install 'terrafix\[ground\]'\n", done.stderr)
+
+
+@pytest.mark.slow
+def test_every_module_of_the_vehicles_wheel_is_imported_without_the_ground(unpacked: Path) -> None:
+    """An import at the top of a module that only the ground has would end `terrafix run` in the field."""
+    extras = [modules(EXTRAS[extra]) for extra in EXTRAS if extra not in ("dev", "nightly")]
+    absent = [*sorted(set().union(*extras) - modules(CORE)), "terrafix_lab"]
+    names = [
+        ".".join(path.relative_to(unpacked).with_suffix("").parts)
+        for path in sorted(unpacked.rglob("*.py"))
+        if path.name not in ("__main__.py", SEARCH.name)
+    ]
+    code = f"import importlib, sys; sys.modules.update(dict.fromkeys({absent}))\nfor name in {names}: "
+    code += "importlib.import_module(name)"
+    environment = {**os.environ, "PYTHONPATH": str(unpacked)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_extra_whose_commands_are_on_the_ground_brings_them() -> None:
+    ground = f"{GROUND['name']}=={PROJECT['version']}"
+    extras = PROJECT["optional-dependencies"]
+    assert {extra for extra in extras if ground in extras[extra]} == set(extras) - WITHOUT_GROUND
+    assert GROUND["dependencies"] == [f"{PROJECT['name']}=={PROJECT['version']}"]
 
 
 def test_the_wheel_has_the_files_of_the_source_tree_and_copies_them(unpacked: Path) -> None:

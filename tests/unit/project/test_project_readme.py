@@ -22,8 +22,9 @@ def lines(path: Path) -> list[str]:
 def clone(folder: Path) -> Path:
     """The files of a clone that the set-up commands need."""
     shutil.copytree(ROOT / "scripts", folder / "scripts")
-    for name in ("pyproject.toml", "requirements.lock"):
-        shutil.copy(ROOT / name, folder)
+    (folder / "tools").mkdir()
+    for name in ("pyproject.toml", "requirements.lock", "tools/pyproject.toml"):
+        shutil.copy(ROOT / name, folder / name)
     return folder
 
 

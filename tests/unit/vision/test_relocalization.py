@@ -131,6 +131,7 @@ def test_while_frames_are_dropped_nothing_is_searched(ground: np.ndarray) -> Non
     """Not while newer frames come before older ones are done; frames that are broken do not matter."""
     run = Flown(ground).fly(OUT[:15] + line((0.0, 0.0), (400.0, 0.0), 90.0) + AWAY[15:])
     assert run.fly(BACK, error=OVERTAKEN).found() == []
+    assert {m.verdict for m in run.published[-len(BACK) :] if isinstance(m, Odometry)} >= {Verdict.OVERTAKEN}
     assert run.fly(BACK[::-1], error="broken JPEG").found() != []
 
 

@@ -13,7 +13,7 @@ from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import rot_w_b
 from terrafix.core.initial_position import start_is_unknown
 from terrafix.vision.sources import open_source
-from terrafix.vision.sources.photos import body_angles_from_gimbal
+from terrafix.vision.sources.xmp import body_angles_from_gimbal
 
 XMP = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'

@@ -2,8 +2,7 @@
 
 import csv
 import json
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +16,11 @@ from terrafix.messages import Frame, GpsInput
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import Shot
 from terrafix_lab.accept.false_inputs.scenarios import LIES_IN_THE_LOOP
-from terrafix_lab.accept.faults.flight_edits import Edit
 from terrafix_lab.accept.generated import KINDS
 from terrafix_lab.accept.measuring.evidence import Evidence, SentFix, gather
-from terrafix_lab.accept.measuring.results import Marks, Span
+from terrafix_lab.accept.measuring.results import Marks
+from terrafix_lab.faults.edits import Edit, Span
+from terrafix_lab.faults.source import Stepwise
 from terrafix_lab.sim.closed_loop.flight import FRAME_HZ as LOOP_HZ
 from terrafix_lab.sim.closed_loop.flight import Conditions, plan_over
 from terrafix_lab.sim.closed_loop.loop import Plan, fly
@@ -108,21 +108,14 @@ class EditedCamera:
     """A view that applies ``edit``, which must give one shot for each shot, to the pictures of another view."""
 
     def __init__(self, view: Callable[[State, int], Image | None], edit: Edit) -> None:
-        self._view = view
-        self._taken: deque[Shot] = deque()
-        self._edited = edit(self._shots())
+        self._view, self._edited = view, Stepwise(edit)
 
     def __call__(self, state: State, index: int) -> Image | None:
         image = self._view(state, index)
         height, width = (0, 0) if image is None else image.shape[:2]
         t_ns = round(state.t_s * 1e9)
         frame = Frame(t_ns=t_ns, frame_id=index, file=f"{index:05d}", width=width, height=height)
-        self._taken.append(Shot(frame, (), image))
-        return next(self._edited).image
-
-    def _shots(self) -> Iterator[Shot]:
-        while True:
-            yield self._taken.popleft()
+        return self._edited(Shot(frame, (), image)).image
 
 
 def sent_fixes(out: Path, without_lie: Path, frame: LocalFrame) -> list[SentFix]:

@@ -21,14 +21,16 @@ from terrafix.map.format import CE90_SIGMAS
 from terrafix.messages import Frame, Message
 from terrafix.vision.sources import Source
 from terrafix_lab.accept.false_inputs.integrity import claim_width, in_lie
-from terrafix_lab.accept.faults.flight_edits import AlteredSource, ThereAndBack, unchanged_origin
 from terrafix_lab.accept.flight import Flight, open_flight
+from terrafix_lab.accept.long_route import ThereAndBack
 from terrafix_lab.accept.measuring.criteria import judge, unmeasured
 from terrafix_lab.accept.measuring.evidence import Evidence, gather
-from terrafix_lab.accept.measuring.results import JudgedRow, Span
+from terrafix_lab.accept.measuring.results import JudgedRow
 from terrafix_lab.accept.plan import CLOSED_LOOP, Plan, Scenario
 from terrafix_lab.accept.scenarios import BY_NAME, LONG_FRAMES
 from terrafix_lab.bench.flights import program_age_s
+from terrafix_lab.faults.edits import Span, unchanged_origin
+from terrafix_lab.faults.source import AlteredSource
 from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import build, ensure_package
 from terrafix_tools.replay import replay

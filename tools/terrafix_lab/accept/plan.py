@@ -1,15 +1,21 @@
 """Definition of a scenario: name, requirement, rows, and the edits that turn a flight into it."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
-from terrafix.messages import Origin
-from terrafix_lab.accept.faults import flight_edits
 from terrafix_lab.accept.flight import Flight
+from terrafix_lab.accept.measuring.criteria import PERMANENT, SCARCE, TEMPORARY, WITH_SPAN
 from terrafix_lab.accept.measuring.results import Marks
+from terrafix_lab.faults.edits import Edit, OriginEdit, unchanged, unchanged_origin
+from terrafix_lab.faults.fault import START, Fault
+from terrafix_lab.sim.flights.folder import FRAME_HZ
 from terrafix_tools.replay import MakeNodes, make_nodes
 
+FRAMES = 160  # of a generated flight
+FAULT_FRAMES = 90  # ... of one with a false or scarce input, at least: 45 s
 CLOSED_LOOP = (
     "closed loop"  # ground of a scenario in which the autopilot navigates by the estimate; over the base ground
 )
@@ -19,8 +25,8 @@ CLOSED_LOOP = (
 class Plan:
     """Edits that turn one flight into the scenario."""
 
-    edit: flight_edits.Edit = flight_edits.unchanged
-    origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin
+    edit: Edit = unchanged
+    origin: OriginEdit = unchanged_origin
     nodes: MakeNodes = make_nodes
     other_map: Callable[[Path, Path], str] | None = (
         None  # (map of the flight, map to write) -> reason for failure, or ""
@@ -29,11 +35,19 @@ class Plan:
     marks: Marks = field(default_factory=Marks)
 
 
-def always(
-    edit: flight_edits.Edit = flight_edits.unchanged, origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin
-) -> Callable[[Flight], Plan]:
-    """The same plan for every flight."""
-    return lambda _: Plan(edit, origin)
+def without_fault(_: Flight) -> Plan:
+    return Plan()
+
+
+def plan_of(fault: Fault, flight: Flight) -> Plan | str:
+    """With the fault of the table from its usual time on."""
+    if flight.duration_s < fault.flight_s:
+        return f"the flight lasts only {flight.duration_s:.0f} s"
+    refs = flight.frame_refs
+    span = fault.span(refs[0].t_s, refs[-1].t_s, refs[flight.at(START)].t_s)
+    is_marked = fault.lasts_s is not None or not fault.is_true
+    marks = Marks(spans=(span,) if is_marked else (), lie=None if fault.is_true else span)
+    return Plan(fault.edit(span), fault.origin or unchanged_origin, marks=marks)
 
 
 @dataclass(frozen=True)
@@ -43,4 +57,13 @@ class Scenario:
     criteria: tuple[str, ...]
     plan: Callable[[Flight], Plan | str]  # a text: the reason why this flight cannot be used
     ground: str = "base"  # of the generated world; a given flight has only "base"
-    frames: int = 160  # of a generated flight
+    frames: int = FRAMES  # of a generated flight
+
+
+def scenario_of(fault: Fault, criteria: tuple[str, ...] | None = None, frames: int = FAULT_FRAMES) -> Scenario:
+    """The scenario of a row of the table of faults. ``criteria`` None: by whether inputs are false, and how long."""
+    if criteria is None:
+        ends = fault.lasts_s is not None
+        criteria = (WITH_SPAN if ends else SCARCE) if fault.is_true else (TEMPORARY if ends else PERMANENT)
+    frames = max(frames, math.ceil(fault.flight_s * FRAME_HZ) + 2)
+    return Scenario(fault.name, fault.words, criteria, partial(plan_of, fault), frames=frames)

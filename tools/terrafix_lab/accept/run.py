@@ -20,8 +20,10 @@ from terrafix_lab.accept.fly import RESULT, Job, Result
 from terrafix_lab.accept.measuring.criteria import failed, unmeasured
 from terrafix_lab.accept.measuring.results import BROKEN, with_unit
 from terrafix_lab.accept.plan import CLOSED_LOOP, Scenario
-from terrafix_lab.accept.scenarios import BY_NAME, SCENARIOS
+from terrafix_lab.accept.scenarios import BY_NAME, COMMAND, SCENARIOS
 from terrafix_lab.accept.table import Acceptance, conclude, write
+from terrafix_lab.faults.fault import check_flown_by
+from terrafix_lab.faults.table import FAULTS
 
 JOB, GROUND_JOB, CRASH = "job.json", "ground.json", "crash.txt"
 QUICK_FRAMES = 120
@@ -115,6 +117,8 @@ def truth_of(flight: str, given: Path | None) -> Path | None:
 def _chosen(options: AcceptOptions) -> list[Scenario]:
     unknown = [name for name in options.scenarios if name not in BY_NAME]
     if unknown:
+        if unknown[0] in FAULTS:
+            check_flown_by(COMMAND, FAULTS[unknown[0]])
         raise UsageError(f"--scenario '{unknown[0]}': not a scenario; known: {', '.join(BY_NAME)}")
     if options.scenarios:
         return [scenario for name, scenario in BY_NAME.items() if name in options.scenarios]

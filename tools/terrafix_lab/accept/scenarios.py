@@ -6,17 +6,20 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.node import Image, Node, NodeContext
-from terrafix_lab.accept.false_inputs import inputs
 from terrafix_lab.accept.false_inputs.maps import REACH, stale_along
 from terrafix_lab.accept.false_inputs.scenarios import LIES
-from terrafix_lab.accept.faults import flight_edits
-from terrafix_lab.accept.faults.nodes import FrameNames, HotComputer, WrongFixes
 from terrafix_lab.accept.flight import Flight
-from terrafix_lab.accept.measuring.criteria import EVERYWHERE
-from terrafix_lab.accept.measuring.results import Marks, Span
-from terrafix_lab.accept.plan import CLOSED_LOOP, Plan, Scenario, always
+from terrafix_lab.accept.measuring.criteria import EVERYWHERE, WITH_SPAN
+from terrafix_lab.accept.measuring.results import Marks
+from terrafix_lab.accept.plan import CLOSED_LOOP, FRAMES, Plan, Scenario, scenario_of, without_fault
+from terrafix_lab.faults import edits, pictures
+from terrafix_lab.faults.edits import Span
+from terrafix_lab.faults.fault import lacking
+from terrafix_lab.faults.nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_lab.faults.table import FAULTS, IMPRECISE_INPUTS
 from terrafix_tools.replay import make_nodes
 
+COMMAND = "terrafix accept --scenario"  # of terrafix_lab.faults.fault.CAMPAIGNS
 FOREIGN_AT = (0.3, 0.55, 0.8)  # of the frames
 FAR_M = 350.0
 BLACKOUT_S, STALL_S = 60.0, 10.0
@@ -28,13 +31,11 @@ LONG_FRAMES = 1500
 OUTLIER_EVERY = 10  # up to 10 % wrong map matches are tolerated (AC-5)
 KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the opposite: 990 m, with a stated sigma of tens of metres
 
-WITH_SPAN = ("claims", "coverage", "false fixes", "both estimates", "within 50 m outside", "says so", "found again")
-
 
 def _foreign_frame(flight: Flight) -> Plan | str:
     if len(flight.frame_refs) < 8:
         return f"the flight has only {len(flight.frame_refs)} frames"
-    mirrored = inputs.mirrored(flight.picture(0))
+    mirrored = pictures.mirrored(flight.picture(0))
     return _foreign({flight.frame_refs[flight.at(share)].file: mirrored for share in FOREIGN_AT})
 
 
@@ -49,10 +50,10 @@ def _far_frame(flight: Flight) -> Plan | str:
     return _foreign({flight.frame_refs[i].file: flight.picture(int(there[i])) for i in at})
 
 
-def _foreign(pictures: dict[str, Image]) -> Plan:
+def _foreign(shown: dict[str, Image]) -> Plan:
     return Plan(
-        flight_edits.foreign_frames(pictures),
-        marks=Marks(wrong_files=frozenset(map(flight_edits.foreign_name, pictures))),
+        edits.foreign_frames(shown),
+        marks=Marks(wrong_files=frozenset(map(edits.foreign_name, shown))),
     )
 
 
@@ -97,7 +98,7 @@ def _gaps(flight: Flight, parts: tuple[tuple[float, float], ...], turning: bool)
         gone |= {s.file for s in flight.frame_refs[gap[0] : gap[1]]}
         breaks.append(flight.frame_refs[gap[1]].t_s)
         spans.append(Span(flight.frame_refs[gap[0]].t_s, breaks[-1], "no frames"))
-    return Plan(flight_edits.without_frames(frozenset(gone)), marks=Marks(spans=tuple(spans), breaks_s=tuple(breaks)))
+    return Plan(edits.without_frames(frozenset(gone)), marks=Marks(spans=tuple(spans), breaks_s=tuple(breaks)))
 
 
 def _sharp_turn(flight: Flight) -> Plan | str:
@@ -150,7 +151,7 @@ def _blackout(flight: Flight) -> Plan | str:
         return f"the flight lasts {flight.duration_s:.0f} s, and {needed_s:.0f} s are needed"
     from_s = flight.frame_refs[0].t_s + (flight.duration_s - BLACKOUT_S) * BEFORE_S / (BEFORE_S + AFTER_S)
     span = Span(from_s, from_s + BLACKOUT_S, "black pictures")
-    return Plan(inputs.black(span), marks=Marks(spans=(span,)))
+    return Plan(pictures.black(span), marks=Marks(spans=(span,)))
 
 
 def _stall(flight: Flight) -> Plan | str:
@@ -158,7 +159,7 @@ def _stall(flight: Flight) -> Plan | str:
         return f"the flight lasts only {flight.duration_s:.0f} s"
     from_s = flight.frame_refs[flight.at(0.5)].t_s
     span = Span(from_s, from_s + STALL_S, "the same picture again and again")
-    return Plan(inputs.frozen(span), marks=Marks(spans=(span,)))
+    return Plan(pictures.frozen(span), marks=Marks(spans=(span,)))
 
 
 def _over_water(flight: Flight) -> Plan:
@@ -170,7 +171,7 @@ def _over_water(flight: Flight) -> Plan:
 def _kidnapped(flight: Flight) -> Plan:
     # Towards the centre of the flight, where the map is.
     ahead = np.where(np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0)
-    return Plan(origin=flight_edits.start_moved(*(ahead * KIDNAPPED_M).tolist()))
+    return Plan(origin=edits.start_moved(*(ahead * KIDNAPPED_M).tolist()))
 
 
 def _hot_day(flight: Flight) -> Plan:
@@ -192,7 +193,7 @@ BASELINE = (
     "asks",
 )  # fmt: skip
 SCENARIOS: tuple[Scenario, ...] = (
-    Scenario("baseline", "A flight without faults.", BASELINE, always()),
+    Scenario("baseline", "A flight without faults.", BASELINE, without_fault),
     Scenario(
         "foreign frame", "Three pictures of another place among the frames: rejected, without effect on the next ones.",
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _foreign_frame),
@@ -218,24 +219,19 @@ SCENARIOS: tuple[Scenario, ...] = (
         (*WITH_SPAN, "asks"), _blackout, frames=270),
     Scenario(
         "GNSS jam", "Jammed after 40 s, with Terrafix as second GPS: the aircraft flies on. Closed loop.",
-        IN_THE_LOOP, always(), ground=CLOSED_LOOP),
+        IN_THE_LOOP, without_fault, ground=CLOSED_LOOP),
     Scenario(
         "slow spoof", "GNSS is correct for 40 s, then drifts at 2 m/s: the aircraft does not follow it. Closed loop.",
-        IN_THE_LOOP, always(), ground=CLOSED_LOOP, frames=300),
+        IN_THE_LOOP, without_fault, ground=CLOSED_LOOP, frames=300),
     Scenario(
-        "season change", "Camera and map in the two seasons that differ most.", EVERYWHERE, always(), ground="season"),
-    Scenario("low texture", "Ground of an eighth of the contrast.", EVERYWHERE, always(), ground="low texture"),
+        "season change", "Camera and map in the two seasons that differ most.",
+        EVERYWHERE, without_fault, ground="season"),
+    Scenario("low texture", "Ground of an eighth of the contrast.", EVERYWHERE, without_fault, ground="low texture"),
     Scenario(
         "water", "A third of the route over open water: no map fix there, and no false one.",
         WITH_SPAN, _over_water, ground="water"),
-    Scenario("hill country", "Relief of some 300 m, a kilometre wide.", EVERYWHERE, always(), ground="hills"),
-    Scenario(
-        "height wrong by 10 %", "The reported height is 10 % too large.",
-        EVERYWHERE, always(flight_edits.height_times(1.10))),
-    Scenario(
-        "compass wrong by 15 degrees", "The reported heading is off by 15 degrees.",
-        EVERYWHERE, always(flight_edits.yaw_plus(15.0))),
-    Scenario("heading unknown", "No heading is reported.", EVERYWHERE, always(flight_edits.yaw_unknown())),
+    Scenario("hill country", "Relief of some 300 m, a kilometre wide.", EVERYWHERE, without_fault, ground="hills"),
+    *(scenario_of(fault, EVERYWHERE, FRAMES) for fault in IMPRECISE_INPUTS),
     Scenario(
         "kidnapped", "The start coordinate has an error of a kilometre and a stated sigma of tens of metres.",
         ("claims", "coverage", "false fixes", "found again", "asks"), _kidnapped),
@@ -245,3 +241,4 @@ SCENARIOS: tuple[Scenario, ...] = (
     Scenario("camera stall", "The camera repeats one picture for 10 s.", WITH_SPAN, _stall),
 )  # fmt: skip
 BY_NAME = {scenario.name: scenario for scenario in (*SCENARIOS, *LIES)}
+BY_NAME |= {name: scenario_of(row) for name, row in FAULTS.items() if name not in BY_NAME and not lacking(COMMAND, row)}

@@ -24,7 +24,7 @@ from terrafix.core.gate import CHI2_95
 from terrafix.core.pose import tangent_to_world
 from terrafix.messages import Message
 from terrafix_lab.bench.result_file import write_result
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Run
 from terrafix_lab.montecarlo.plan import FlightPlan, plan
 from terrafix_lab.standalone import run_standalone
@@ -65,7 +65,7 @@ class RecordedRun(Run):
 
 def uncalibrated(number: int, duration_s: float = DURATION_S) -> FlightPlan:
     """Flight ``number``, with the wrong camera."""
-    drawn = plan(SEED, number, fault=Fault.NONE, duration_s=duration_s)
+    drawn = plan(SEED, number, fault=DrawnFault.NONE, duration_s=duration_s)
     camera = msgspec.structs.replace(drawn.camera, focal_sigma=FOCAL_SIGMA)
     return replace(drawn, camera=camera, focal_error=FOCAL_ERROR, k1_error=K1_ERROR)
 

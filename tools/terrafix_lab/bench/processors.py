@@ -29,7 +29,7 @@ from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights.make import FlightOptions, make
 from terrafix_lab.standalone import run_standalone
 from terrafix_tools.estimates import ESTIMATES, read_rows
-from terrafix_tools.finalise.output import SUMMARY, TABLE
+from terrafix_tools.finalised import SUMMARY, TABLE
 from terrafix_tools.timing import machine
 
 RESULT = "processors.json"

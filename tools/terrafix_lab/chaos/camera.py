@@ -1,45 +1,26 @@
-"""The camera of the fault matrix: streams the images of the flight, and what is wrong with them."""
+"""The camera of the fault matrix: streams the images of the flight, edited by the fault."""
 
 import math
 import threading
 import time
-from collections.abc import Callable
-from enum import StrEnum
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
 
-from terrafix.messages import Camera
+from terrafix.messages import Camera, Frame
+from terrafix.vision.sources import Shot
+from terrafix_lab.faults.edits import Edit, unchanged
 from terrafix_lab.sim.camera.stream import FrameStream
 from terrafix_lab.sim.flights.folder import FRAME_HZ
 
-EXPOSURE_GAIN = 6.0  # of the overexposed image: all but the darkest ground is white
-DEFOCUS_PX = 12.0  # 1-sigma of the blur
+REPEATED_AFTER = 0.1  # of a period: between images with the same time
 SLACK = 1e-3  # share of a period: an image that is sent so much too early is the one that is due
-NS = 1_000_000_000
-
-
-class Look(StrEnum):
-    """What the camera sends."""
-
-    GOOD = "good"
-    NOTHING = "nothing"  # the cable is unplugged
-    FROZEN = "frozen"  # the same image again and again, with new time stamps
-    BLACK = "black"
-    OVEREXPOSED = "overexposed"
-    DEFOCUSED = "defocused"
-    SMALL = "small"  # half the width and height
-    TORN = "torn"  # bytes that are no JPEG
-    TEN_TIMES = "ten times"  # each image ten times, 20 a second
-    AHEAD = "stamps ahead"  # time stamps 5 s in the future
-    LATE = "stamps late"  # time stamps 3 s in the past
-
-
-SHIFT_NS = {Look.AHEAD: 5 * NS, Look.LATE: -3 * NS}
 
 
 class StreamedCamera:
-    """A context manager. ``look`` may be changed at any time."""
+    """A context manager. ``edit`` may be changed at any time; it sees the shots
+    from then on, with times of the monotonic clock."""
 
     def __init__(
         self,
@@ -51,10 +32,10 @@ class StreamedCamera:
         """``image_at``: JPEG by the time of the flight; ``flight_s``: that time now.
 
         Images exist at multiples of 1 / ``frame_hz``: each is sent at its own time, and stamped with it."""
-        self.look = Look.GOOD
-        self.pushed = 0
+        self.edit: Edit = unchanged
+        self.pushed_s: list[float] = []  # monotonic time of each image
         self._stream, self._image_at, self._flight_s = stream, image_at, flight_s
-        self._frozen, self._frame_hz = b"", frame_hz
+        self._frame_hz, self._wait_s = frame_hz, 0.0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="chaos-camera", daemon=True)
 
@@ -67,38 +48,54 @@ class StreamedCamera:
         self._thread.join()
 
     def _run(self) -> None:
-        wait_s = 0.0
-        while not self._stopping.wait(wait_s):
-            look, now_ns, flight_s = self.look, time.monotonic_ns(), self._flight_s()
+        while not self._stopping.is_set():
+            edit = self.edit
+            jpegs = _Jpegs(decoded=edit is not unchanged)
+            before_ns = 0
+            for shot in edit(self._shots(edit, jpegs)):
+                if shot.frame.t_ns == before_ns:  # another one of the same time
+                    self._stopping.wait(REPEATED_AFTER / self._frame_hz)
+                before_ns = shot.frame.t_ns
+                self._stream.push_jpeg(jpegs.of(shot), shot.frame.t_ns)
+                self.pushed_s.append(time.monotonic())
+
+    def _shots(self, edit: Edit, jpegs: "_Jpegs") -> Iterator[Shot]:
+        """Each when its time has come, until there is another edit."""
+        while not self._stopping.wait(self._wait_s):
+            self._wait_s = 0.0
+            if self.edit is not edit:
+                return
+            now_ns, flight_s = time.monotonic_ns(), self._flight_s()
             late_s = flight_s - math.floor(flight_s * self._frame_hz + SLACK) / self._frame_hz
-            good = self._image_at(flight_s - late_s)
-            self._frozen = good if look is not Look.FROZEN else self._frozen
-            if look is not Look.NOTHING:
-                stamp_ns = now_ns - round(1e9 * late_s) + SHIFT_NS.get(look, 0)
-                self._stream.push_jpeg(self._frozen if look is Look.FROZEN else altered(good, look), stamp_ns)
-                self.pushed += 1
+            t_ns = now_ns - round(1e9 * late_s)
+            yield jpegs.shot(self._image_at(flight_s - late_s), t_ns)
             spent_s = (time.monotonic_ns() - now_ns) / 1e9
-            period_s = 1.0 / self._frame_hz / (10.0 if look is Look.TEN_TIMES else 1.0)
-            wait_s = max(0.0, period_s - spent_s - (late_s if look is not Look.TEN_TIMES else 0.0))
+            self._wait_s = max(0.0, 1.0 / self._frame_hz - spent_s - late_s)
 
 
-def altered(jpeg: bytes, look: Look) -> bytes:
-    """The image as a camera with this fault sends it."""
-    if look is Look.TORN:
-        return jpeg[: len(jpeg) // 3][::-1]
-    if look not in (Look.BLACK, Look.OVEREXPOSED, Look.DEFOCUSED, Look.SMALL):
-        return jpeg
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
-    if look is Look.BLACK:
-        image = np.zeros_like(image)
-    elif look is Look.OVEREXPOSED:
-        image = cv2.convertScaleAbs(image, alpha=EXPOSURE_GAIN, beta=60)
-    elif look is Look.DEFOCUSED:
-        image = cv2.GaussianBlur(image, (0, 0), DEFOCUS_PX)
-    else:
-        image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", image)[1].tobytes()
+class _Jpegs:
+    """Shots from JPEG, and JPEG of shots: the same bytes if the image is the same."""
+
+    def __init__(self, *, decoded: bool) -> None:
+        self._decoded = decoded
+        self._image: np.ndarray = np.zeros(0, np.uint8)
+        self._jpeg = b""
+
+    def shot(self, jpeg: bytes, t_ns: int) -> Shot:
+        self._image, self._jpeg = np.frombuffer(jpeg, np.uint8), jpeg
+        if self._decoded:
+            image = cv2.imdecode(self._image, cv2.IMREAD_COLOR)
+            assert image is not None
+            self._image = image
+        return Shot(Frame(t_ns=t_ns, frame_id=0, file="", width=0, height=0), (), self._image)
+
+    def of(self, shot: Shot) -> bytes:
+        """Of a shot without an image bytes that are no JPEG."""
+        if shot.image is None:
+            return self._jpeg[: len(self._jpeg) // 3][::-1]
+        if shot.image is self._image:
+            return self._jpeg
+        return cv2.imencode(".jpg", shot.image)[1].tobytes()
 
 
 def camera_toml(camera: Camera, attitude_sigma_deg: float | None = None) -> str:

@@ -34,19 +34,31 @@ def chaos(
 
     Results are kept in OUT/results.json; a matrix that was interrupted goes on. Exit code 1: a promise is broken, or a
     cell had no fix before its fault."""
-    from terrafix_lab.chaos.faults import FAULTS
     from terrafix_lab.chaos.recorded_scene import recorded_scene
     from terrafix_lab.chaos.run import Results, fly_matrix
-    from terrafix_lab.chaos.scene import Phase, scene_in
+    from terrafix_lab.chaos.scene import scene_in
     from terrafix_lab.chaos.table import line, write_table
+    from terrafix_lab.faults.fault import Phase, check_flown_by
+    from terrafix_lab.faults.table import FAULTS, MATRIX
 
-    faults = [f for f in FAULTS if not fault or any(f.name.startswith(name) for name in fault)]
+    faults = [f for f in FAULTS.values() if any(f.name.startswith(name) for name in fault)] if fault else [*MATRIX]
     phases = [p for p in Phase if (not phase or p.value in phase) and not (flight and p is Phase.LANDING)]
     if not faults or not phases:
         raise UsageError("no such fault or phase; 'terrafix chaos --list' names them")
     if list_only:
-        typer.echo("\n".join(["phases:", *(f"  {p}" for p in Phase), "faults:", *(f"  {f.name}" for f in FAULTS)]))
+        typer.echo(
+            "\n".join(
+                [
+                    "phases:",
+                    *(f"  {p}" for p in Phase),
+                    "faults:",
+                    *(f"  {f.name:36} {f.words}".rstrip() for f in FAULTS.values()),
+                ]
+            )
+        )
         return
+    for chosen in faults:
+        check_flown_by("terrafix chaos --fault", chosen)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -10,7 +10,8 @@ from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.sources.description import camera_of, read_description
 from terrafix.vision.sources.table import Row, read_table
-from terrafix_lab.chaos.scene import LEAD_S, STRAIGHT_RADPS, Phase, Scene, middle_of_longest
+from terrafix_lab.chaos.scene import LEAD_S, STRAIGHT_RADPS, Scene, middle_of_longest
+from terrafix_lab.faults.fault import Phase
 from terrafix_lab.sim.autopilot.course import Course, PeerState, read_course, write_course
 from terrafix_tools.evaluate import Truth, read_truth, truth_sigma_of
 from terrafix_tools.flight_map import package_of

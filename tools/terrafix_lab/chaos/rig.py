@@ -1,5 +1,6 @@
 """The real processes of Terrafix beside a simulated camera and autopilot, with access to all that may fail."""
 
+import math
 import os
 import signal
 import subprocess
@@ -7,10 +8,10 @@ import sys
 import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
-from enum import StrEnum
 from pathlib import Path
 
 from terrafix.core.errors import SourceError
+from terrafix.messages import Origin
 from terrafix.runtime.run_dir import PREFIX, SHM, write_atomic
 from terrafix_lab.chaos.camera import StreamedCamera, camera_toml
 from terrafix_lab.chaos.console import Console
@@ -18,6 +19,9 @@ from terrafix_lab.chaos.memory_group import MemoryGroup
 from terrafix_lab.chaos.scene import Scene
 from terrafix_lab.chaos.serial_line import SerialLine
 from terrafix_lab.chaos.switches import Switches
+from terrafix_lab.faults.edits import Edit, OriginEdit, unchanged, unchanged_origin
+from terrafix_lab.faults.fault import Need
+from terrafix_lab.faults.processes import COOL_MC, SUPERVISOR
 from terrafix_lab.sim.autopilot.course import PeerState
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.autopilot.peer import AutopilotPeer
@@ -27,47 +31,40 @@ from terrafix_tools import child_process
 RESTART_S = 0.1  # RestartSec= of the systemd unit, whose part the rig takes
 START_LIMIT_S = 90.0  # until the camera is opened, on a computer that others use too
 STOP_LIMIT_S = 45.0  # TimeoutStopSec= of the unit
-COOL_MC = 40_000  # of the simulated thermal zone
+START_SIGMA_M = 10.0  # of the start, which `terrafix run` states itself
 SHARED_MB = 128  # shared memory of its own: frames take 18 MB, and descriptors of the map some more
 NONE = Path()
-SUPERVISOR = "supervisor"
-
-
-class Need(StrEnum):
-    """What a fault needs beside camera, autopilot and map. ROOT: only root can mount it."""
-
-    DISK = "a disk of its own for the record"
-    SHARED_MEMORY = "shared memory of its own"
-    SERIAL = "a serial line to the autopilot"
-    SWITCHES = "the switches of switches.py"
-    MODEL = "the weights of XFeat"
-    CONSOLE = "a console that shows the flight"
-    MEMORY_GROUP = "a control group of memory"
-
-
-ROOT = frozenset({Need.DISK, Need.SHARED_MEMORY, Need.MEMORY_GROUP})
 
 
 class Rig:
     """One start of Terrafix in a folder. A context manager, which stops all that it has started."""
 
     def __init__(
-        self, scene: Scene, folder: Path, start_s: float, *, seed: int, needs: Collection[Need] = (), model: Path = NONE
+        self,
+        scene: Scene,
+        folder: Path,
+        start_s: float,
+        *,
+        seed: int,
+        needs: Collection[Need] = (),
+        model: Path = NONE,
+        origin: OriginEdit = unchanged_origin,
     ) -> None:
         """``start_s``: second of the flight at which it begins; ``needs``: what it has beside the usual, with ``model``
-        the weights of XFeat.
+        the weights of XFeat; ``origin``: edits the stated start and camera.
 
         ``folder`` is new; the record is in its folder ``out``. Raises OSError."""
-        self.scene, self.folder, self.out = scene, folder, folder / "out"
-        self.map_path = folder / "map.gpkg"
+        self.scene, self.folder = scene, folder
+        self.out: Path = folder / "out"
+        self.map_path: Path = folder / "map.gpkg"
         self.began_s: float | None = None  # monotonic time of ``start_s``; None: the vehicle is held in the air
         self.busy: list[subprocess.Popen[bytes]] = []  # other programs that a fault has started
-        self._start_s = start_s
+        self._start_s, self._origin = start_s, origin
         folder.mkdir(parents=True)
         self.out.mkdir()
         self.map_path.write_bytes(scene.map_path.read_bytes())
         self.set_temperature(COOL_MC)
-        self.peer = AutopilotPeer(seed=seed, kind=Kind.COPTER, home_amsl_m=self._home_amsl_m())
+        self.peer: AutopilotPeer = AutopilotPeer(seed=seed, kind=Kind.COPTER, home_amsl_m=self._home_amsl_m())
         self.stream = FrameStream()
         self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s, scene.frame_hz)
         self.switches = Switches(folder / "switches")
@@ -117,6 +114,11 @@ class Rig:
         if Need.CONSOLE in self._needs:
             self.console = Console(next(self.run_folders()), self.folder)
         self.began_s = time.monotonic()
+
+    def edit_inputs(self, edit: Edit) -> None:
+        """Of camera and autopilot, from now on."""
+        self.camera.edit = edit
+        self.peer.edit_telemetry(None if edit is unchanged else edit)
 
     def flight_s(self) -> float:
         """Second of the flight."""
@@ -216,12 +218,26 @@ class Rig:
 
     def _write_config(self, port: int) -> None:
         first = self._state(self._start_s)
+        stated = self._origin(
+            Origin(
+                t_ns=0,
+                camera=self.scene.camera,
+                lat_deg=first.lat_deg,
+                lon_deg=first.lon_deg,
+                ground_amsl_m=None,
+                start_sigma_m=START_SIGMA_M,
+                yaw_sigma_deg=0.0,
+                agl_sigma_m=0.0,
+                attitude_sigma_deg=0.0,
+            )
+        )
+        start = f'start = "{stated.lat_deg:.6f},{stated.lon_deg:.6f}"\n' if math.isfinite(stated.start_sigma_m) else ""
         camera = self.folder / "camera.toml"
-        camera.write_text(camera_toml(self.scene.camera, self.scene.attitude_sigma_deg))
+        camera.write_text(camera_toml(stated.camera, self.scene.attitude_sigma_deg))
         (self.folder / "terrafix.toml").write_text(
             f'[map]\npath = "{self.map_path}"\n'
             f'[source]\npath = "{self.stream.url}"\ncamera = "{camera}"\nrate_hz = 20\n'
-            f'start = "{first.lat_deg:.6f},{first.lon_deg:.6f}"\n'
+            f"{start}"
             f'[link]\ndevice = "{self.line.device if self.line else f"udpout:127.0.0.1:{port}"}"\n'
             f'[health]\nsysfs_root = "{self.folder / "sys"}"\n'
             f'[recorder]\nframes = "none"\n'

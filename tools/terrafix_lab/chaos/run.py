@@ -15,13 +15,17 @@ from terrafix.core.errors import OutputError, SourceError
 from terrafix.messages import GpsInput
 from terrafix.recorder.reader import read_flight
 from terrafix_lab.chaos import verdict as judge
-from terrafix_lab.chaos.camera import Look
-from terrafix_lab.chaos.faults import DISK_MB, Fault
-from terrafix_lab.chaos.rig import NONE, ROOT, Need, Rig
-from terrafix_lab.chaos.scene import LEAD_S, Phase, Scene
+from terrafix_lab.chaos.rig import NONE, Rig
+from terrafix_lab.chaos.scene import LEAD_S, Scene
 from terrafix_lab.chaos.verdict import Outcome
+from terrafix_lab.faults.edits import EVER, Span, unchanged, unchanged_origin
+from terrafix_lab.faults.fault import ROOT, Fault, Need, Phase, Process
+from terrafix_lab.faults.pictures import black
+from terrafix_lab.track import measured
 from terrafix_tools.score import longest_gap_s
 
+DISK_MB = 24  # of a disk of its own
+WHOLE_S = 20.0  # that a fault of a whole flight lasts
 DARK_LEAD_S = 4.0  # black images before the fault
 STEP_S = 0.01
 STEADY_S = 3.0  # with fixes after the fault; then the cell is over
@@ -36,7 +40,15 @@ def fly_cell(scene: Scene, fault: Fault, phase: Phase, folder: Path, *, seed: in
     if missing:
         return Outcome(fault=fault.name, phase=phase, verdict=f"{NOT_HERE}: {missing}")
     lead_s = 0.5 if phase is Phase.START else LEAD_S
-    rig = Rig(scene, folder, scene.at_s[phase] - lead_s, seed=seed, needs=fault.needs, model=model)
+    rig = Rig(
+        scene,
+        folder,
+        scene.at_s[phase] - lead_s,
+        seed=seed,
+        needs=fault.needs,
+        model=model,
+        origin=fault.origin or unchanged_origin,
+    )
     try:
         if Need.DISK in fault.needs:
             _mount_disk(rig.out)
@@ -73,17 +85,21 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
     fault_s = rig.began_s + lead_s
     if phase is Phase.DARK:
         _wait(rig, fault_s - DARK_LEAD_S)
-        rig.camera.look = Look.BLACK
+        rig.camera.edit = black(EVER)
     _wait(rig, fault_s)
     if phase is not Phase.START:
         _wait_for_first_fix(rig)
     before = rig.peer.fixes()
     fault_s = time.monotonic()
-    fault.begin(rig)
-    _wait(rig, fault_s + fault.lasts_s, lambda: fault.during(rig, time.monotonic() - fault_s))
-    if phase is Phase.DARK:
-        rig.camera.look = Look.GOOD
-    fault.end(rig)
+    process = fault.process or Process()
+    lasts_s = WHOLE_S if fault.lasts_s is None else fault.lasts_s
+    span = Span(fault_s, fault_s + lasts_s, fault.name)
+    if fault.source is not None:
+        rig.edit_inputs(fault.edit(span))
+    process.begin(rig)
+    _wait(rig, fault_s + lasts_s, lambda: process.during(rig, time.monotonic() - fault_s))
+    rig.edit_inputs(unchanged)
+    process.end(rig)
     ended_s = time.monotonic()
     _wait_for_fix(rig, ended_s)
     end_s = time.monotonic()
@@ -101,6 +117,7 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
         silence_s=longest_gap_s(rig.peer.received_s, fault_s, end_s),
         without_fix_s=judge.without_fix_s(times, fault_s, end_s),
         back_s=judge.back_s(times, ended_s, end_s),
+        criteria=measured([judge.track_of(fixes, span, rig.camera.pushed_s)]),
         load=os.getloadavg()[0] / (os.cpu_count() or 1),
     )
 
@@ -142,7 +159,9 @@ def _with_record(rig: Rig, fault: Fault, phase: Phase, outcome: Outcome) -> Outc
         stop_s=rig.stop_s,
     )
     lasting = outcome.verdict or judge.text_of(
-        outcome, fix_expected=phase not in fault.no_fix_in, record_expected=not _hits_record(fault)
+        outcome,
+        fix_expected=fault.origin is None and phase not in fault.no_fix_in,
+        record_expected=not _hits_record(fault),
     )
     return msgspec.structs.replace(outcome, verdict=lasting)
 

@@ -3,13 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import Camera
+from terrafix_lab.faults.fault import Phase
 from terrafix_lab.sim.autopilot.course import Course, PeerState, peer_state_of, read_course, write_course
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights.folder import CAMERA, FRAME_HZ, Flight
@@ -26,16 +26,6 @@ CRUISE_SHARE = 0.95  # of the greatest height
 STRAIGHT_RADPS = 0.05  # a turn is faster
 LEAD_S = 12.0  # flown before the fault, for the first fixes
 COURSE = "course.csv"
-
-
-class Phase(StrEnum):
-    """When the fault begins."""
-
-    START = "before the first fix"  # of the processes, in cruise
-    CRUISE = "cruise"
-    TURN = "turn"
-    DARK = "dark"  # in cruise; the images are black from 4 s before the fault to its end
-    LANDING = "landing"  # as the descent begins
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from terrafix.core.errors import OutputError, SourceError
-from terrafix_lab.chaos.faults import FAULTS
-from terrafix_lab.chaos.scene import Phase
 from terrafix_lab.chaos.verdict import NO_FIX, Outcome
+from terrafix_lab.faults.fault import Phase
+from terrafix_lab.faults.table import FAULTS, MATRIX
 
 
 def line(outcome: Outcome) -> str:
@@ -22,7 +22,7 @@ def line(outcome: Outcome) -> str:
         "not recorded": _s(outcome.not_recorded_s),
         "stop": _s(outcome.stop_s),
     }
-    shown = ", ".join(f"{name} {value}" for name, value in figures.items())
+    shown = ", ".join(f"{name} {value}" for name, value in {**figures, **outcome.criteria}.items())
     return f"{outcome.fault:28} {outcome.phase:21} {shown}: {outcome.verdict}"
 
 
@@ -37,11 +37,14 @@ def cell(outcome: Outcome | None) -> str:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Faults by phases, of the phases of which there is any outcome, and a line that sums all cells up."""
+    """Faults by phases (those of MATRIX, others if flown; phases of which there is any outcome), and a line that sums
+    all cells up."""
     found = {(o.fault, o.phase): o for o in outcomes}
     phases = [phase for phase in Phase if any(o.phase == phase for o in outcomes)]
     rows = [f"| fault | {' | '.join(phases)} |", f"|---|{'---|' * len(phases)}"]
-    for fault in FAULTS:
+    for fault in FAULTS.values():
+        if fault not in MATRIX and not any((fault.name, phase) in found for phase in phases):
+            continue
         cells = (cell(found.get((fault.name, phase))) for phase in phases)
         rows.append(f"| {fault.name} | {' | '.join(cells)} |")
     return "\n".join([*rows, "", _sum([o for o in outcomes if o.silence_s is not None and o.verdict != NO_FIX])])

@@ -5,8 +5,11 @@ import math
 from collections.abc import Sequence
 
 import msgspec
+import numpy as np
 
+from terrafix_lab.faults.edits import Span
 from terrafix_lab.sim.autopilot.report import ReceivedFix
+from terrafix_lab.track import Track
 
 # A position is wrong when its error is above this many times its horiz_accuracy (1-sigma of the worst axis): of a true
 # claim 3 of 10 000 are, exp(-4^2 / 2).
@@ -33,7 +36,14 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     back_s: float | None = None  # from the end of the fault to a lasting fix; None: not back, or none before
     not_recorded_s: float | None = None  # longest time of GPS_INPUT that the record lacks
     stop_s: float | None = None  # that the ordered stop took
+    criteria: dict[str, str] = {}  # those of terrafix_lab/track.py
     load: float | None = None  # load average of the computer over its cores at the end
+
+
+def track_of(fixes: Sequence[ReceivedFix], fault: Span | None, frames_s: Sequence[float]) -> Track:
+    """Of the 3D fixes; the claim is that of the worst axis. ``frames_s``: times of the images."""
+    t_s, error_m, sigma_m = np.array([(f.received_s, f.error_m, f.horizontal_m) for f in fixes]).reshape(-1, 3).T
+    return Track(t_s, error_m, (error_m / sigma_m) ** 2, sigma_m, fault, frames_s)
 
 
 def without_fix_s(fixes_s: Sequence[float], from_s: float, to_s: float) -> float:

@@ -2,6 +2,7 @@
 says so); any other exception is a bug."""
 
 import io
+import struct
 import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from terrafix.core.config import Config, LinkSection
 from terrafix.core.config import load as load_config
@@ -31,6 +33,7 @@ from terrafix.vision.sources.exif import read_info
 from terrafix.vision.sources.images import decode_image
 from terrafix.vision.sources.mjpeg import MjpegCapture
 from terrafix.vision.sources.table import read_table
+from terrafix.vision.sources.xmp import read_xmp
 from terrafix_lab.sim.autopilot.fuzz_wire import UNIX_NS, Autopilot
 from terrafix_lab.sim.autopilot.wire import heartbeat
 from terrafix_lab.sim.closed_loop.loopback import Loopback
@@ -48,7 +51,7 @@ class Target:
 
     name: str
     seeds: Callable[[], list[bytes]]
-    run: Callable[[bytes], None]
+    run: Callable[[bytes], object]
 
 
 def _in_file(suffix: str, read: Callable[[Path], object]) -> Callable[[bytes], None]:
@@ -66,6 +69,65 @@ def _in_file(suffix: str, read: Callable[[Path], object]) -> Callable[[bytes], N
 def _images() -> list[bytes]:
     image = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
     return [cv2.imencode(suffix, image)[1].tobytes() for suffix in (".jpg", ".png", ".webp", ".tiff", ".bmp")]
+
+
+def _photos() -> list[bytes]:
+    """Photos with the tags of several makers."""
+    pixels = np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    found = []
+    for packet in _xmp_packets():
+        exif = Image.Exif()
+        exif[0x0110] = "L1D-20c"
+        tags = {0x9003: "2024:06:01 10:00:00", 0x920A: 10.26, 0xA002: WIDTH, 0xA003: HEIGHT, 0xA404: 2.0, 0xA405: 28}
+        exif.get_ifd(0x8769).update({**tags, 0xA20E: 40.0, 0xA210: 4})
+        exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 8.0, 1.5), 3: "E", 4: (14.0, 21.0, 3.0)})
+        stream = io.BytesIO()
+        Image.fromarray(pixels).save(stream, "JPEG", exif=exif, xmp=packet)
+        found.append(stream.getvalue())
+    return [*found, *_images()]
+
+
+def _xmp_packets() -> list[bytes]:
+    gimbal = 'drone-dji:GimbalYawDegree="+30.0" drone-dji:GimbalPitchDegree="-90.0" drone-dji:RelativeAltitude="+80.5"'
+    centre = 'drone-dji:CalibratedOpticalCenterX="32" drone-dji:CalibratedOpticalCenterY="24"'
+    lens = f'drone-dji:CalibratedFocalLength="50.0" {centre}'
+    bodies = (
+        f'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {gimbal} {lens}',
+        'xmlns:C="http://pix4d.com/camera/1.0/" C:Yaw="3000/100" C:Pitch="1.5" C:Roll="0" C:AboveGroundAltitude="80"',
+        'drone-parrot:CameraYawDegree="30" drone-parrot:CameraPitchDegree="-90" drone-parrot:CameraRollDegree="0"',
+    )
+    return [f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description {body}/></x:xmpmeta>'.encode() for body in bodies]
+
+
+def _dataflash_logs() -> list[bytes]:
+    """Binary and text, whole and with the first bytes lost."""
+    formats = [
+        (128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns"),
+        (10, 23, "ATT", "Qfff", "TimeUS,Roll,Pitch,Yaw"),
+        (12, 14, "MODE", "QMBB", "TimeUS,Mode,ModeNum,Rsn"),
+    ]
+    binary = b"".join(
+        b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, length, *(text.encode() for text in texts))
+        for number, length, *texts in formats
+    )
+    binary += b"\xa3\x95\x0c" + struct.pack("<QBBB", 1_000_000, 5, 5, 1)
+    text = "".join(f"FMT, {number}, {length}, {', '.join(texts)}\r\n" for number, length, *texts in formats)
+    for k in range(30):
+        binary += b"\xa3\x95\x0a" + struct.pack("<Qfff", 1_000_000 + 100_000 * k, 0.1 * k, 0.0, 90.0)
+        text += f"ATT, {1_000_000 + 100_000 * k}, {0.1 * k:.2f}, 0.00, 90.00\r\n"
+    return [binary, binary[40:], bytes(512) + binary, text.encode(), text.encode()[20:]]
+
+
+def _logs() -> list[bytes]:
+    """Telemetry logs: whole, torn at the front, with a clock that jumps, and of two vehicles."""
+    (log,) = _telemetry()[1]
+    packets = [
+        packet for step in range(STEPS) for packet in Autopilot(signed=False).packets(step, step * 20_000_000, b"")
+    ]
+    jumping = [
+        record(47_000_000 + 20_000 * i + (10**15 if i > len(packets) // 2 else 0), p) for i, p in enumerate(packets)
+    ]
+    return [log, log[13:], b"".join(jumping), log + log.replace(b"\x01\x01", b"\x02\x01")]
 
 
 def _configs() -> list[bytes]:
@@ -211,18 +273,20 @@ def _image(data: bytes) -> None:
 
 TARGETS: tuple[Target, ...] = (
     Target("mavlink", lambda: _telemetry()[0], _receive),
-    Target("telemetry log", lambda: _telemetry()[1], _in_file(".tlog", _read_log)),
+    Target("telemetry log", _logs, _in_file(".tlog", _read_log)),
     Target("configuration", _configs, _in_file(".toml", lambda path: load_config([path]))),
     Target("description", _descriptions, _in_file(".toml", read_description)),
     Target("frames.csv", _tables, _in_file(".csv", lambda path: read_table(path, "frames.csv", with_file=True))),
     Target("image", _images, _image),
-    Target("photo", _images, _in_file(".jpg", read_info)),
+    Target("photo", _photos, _in_file(".jpg", read_info)),
+    Target("photo tags", _xmp_packets, read_xmp),
     Target("stream", _streams, _stream),
     Target("record", _records, _in_file(".mcap", _read_record)),
     Target("map", _maps, _in_file(".gpkg", _read_map)),
     Target("mission", _missions, _in_file(".waypoints", read_mission)),
     Target("plan", _missions, _in_file(".plan", read_mission)),
-    Target("autopilot log", lambda: _telemetry()[1], _in_file(".tlog", read_autopilot_log)),
+    Target("DataFlash log", _dataflash_logs, _in_file(".bin", read_autopilot_log)),
+    Target("autopilot log", _logs, _in_file(".tlog", read_autopilot_log)),
     Target("start", lambda: [b"48.1,11.2"], _start),
 )
 

@@ -32,8 +32,8 @@ from terrafix_lab.montecarlo.flight import Run
 from terrafix_lab.montecarlo.plan import plan
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights import make as making
-from terrafix_tools.finalise.output import TABLE
 from terrafix_tools.finalise.run import finalise
+from terrafix_tools.finalised import TABLE
 from terrafix_tools.replay import MakeNodes, make_nodes, replay
 
 VILLAGE, TOWN = "flights/village-1", "flights/town-a"

@@ -5,8 +5,6 @@ from typing import Annotated
 
 import typer
 
-from terrafix_lab.montecarlo.fault import Fault
-
 BROKEN_FLOOR = 1  # exit code
 
 
@@ -17,7 +15,7 @@ def montecarlo(
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random draws.")] = 1,
     duration: Annotated[float, typer.Option(help="Seconds of every flight.")] = 600.0,
     fault: Annotated[
-        Fault | None, typer.Option(help="This fault in every flight, instead of the usual sequence.")
+        str | None, typer.Option(help="This fault in every flight, instead of the usual sequence.")
     ] = None,
     lies: Annotated[
         float,
@@ -35,12 +33,12 @@ def montecarlo(
 
     Exit code 0: all floors hold, or the flights are too few to judge one; 1: one does not hold."""
     from terrafix_lab.montecarlo.endurance import endurance
-    from terrafix_lab.montecarlo.run import RunOptions
+    from terrafix_lab.montecarlo.run import RunOptions, fault_of
     from terrafix_lab.montecarlo.run import montecarlo as run
 
     if long:
         raise typer.Exit(0 if endurance(seed)["flat"] else BROKEN_FLOOR)
-    options = RunOptions(out, flights, first, seed, duration, fault, lies, workers)
+    options = RunOptions(out, flights, first, seed, duration, fault and fault_of(fault), lies, workers)
     result = run(options)
     typer.echo(f"Written to {out}")
     raise typer.Exit(BROKEN_FLOOR if False in result["floors"].values() else 0)

@@ -14,7 +14,7 @@ from rich.console import Console
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import CheckpointGround, EstimatorCheckpoint, ground_of
 from terrafix.messages import CalibrationEstimate, MapMatch, Message, NavEstimate, Odometry, Origin
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Run
 from terrafix_lab.montecarlo.plan import FlightPlan, plan
 
@@ -77,7 +77,7 @@ class RestartComparison(Run):
 
 def endurance(seed: int) -> dict[str, Any]:
     """Flies for HOURS without the refinement after landing. -> ``slopes``, which are printed as well."""
-    flight = RestartComparison(plan(seed, 0, fault=Fault.NONE, duration_s=3600.0 * HOURS), YOUNG_FROM_S)
+    flight = RestartComparison(plan(seed, 0, fault=DrawnFault.NONE, duration_s=3600.0 * HOURS), YOUNG_FROM_S)
     record = flight.record(refine=False)
     alone = (record.t_s >= SETTLED_S) & (record.t_s < YOUNG_FROM_S)
     compared = np.array(flight.frames_ms)[-int((record.t_s >= YOUNG_FROM_S + SETTLED_S).sum()) :]

@@ -1,9 +1,9 @@
-"""Faults of a flight of the Monte Carlo run. Apart from the rest: the command line does not load the simulator."""
+"""Faults of a flight of the Monte Carlo run whose sizes are drawn; others are in terrafix_lab/faults/table.py."""
 
 from enum import StrEnum
 
 
-class Fault(StrEnum):
+class DrawnFault(StrEnum):
     """A flight has one fault or none; with --lies in addition some of LIES, its false inputs."""
 
     NONE = "none"
@@ -28,12 +28,12 @@ class Fault(StrEnum):
 
 
 LIES = (
-    Fault.FOREIGN,
-    Fault.FROZEN,
-    Fault.STALE,
-    Fault.SCALE,
-    Fault.FOCAL,
-    Fault.HEADING,
-    Fault.START,
-    Fault.TOWN,
+    DrawnFault.FOREIGN,
+    DrawnFault.FROZEN,
+    DrawnFault.STALE,
+    DrawnFault.SCALE,
+    DrawnFault.FOCAL,
+    DrawnFault.HEADING,
+    DrawnFault.START,
+    DrawnFault.TOWN,
 )

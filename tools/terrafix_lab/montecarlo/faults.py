@@ -8,7 +8,7 @@ import numpy as np
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pnp import solved
 from terrafix.messages import MapMatch, Verdict
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flown import Shot
 from terrafix_lab.sim.true_messages import placed
 
@@ -29,7 +29,7 @@ WRONG_SIGMA_M, WRONG_SIGMA_RAD = 2.5, math.radians(1.0)  # stated 1-sigma of a w
 class Faults:
     """Of one flight. Call ``alter`` once for every frame, in order."""
 
-    def __init__(self, fault: Fault, duration_s: float, seed: int) -> None:
+    def __init__(self, fault: str, duration_s: float, seed: int) -> None:
         self._fault, self._duration_s = fault, duration_s
         self._rng = np.random.default_rng([seed, 57])
         self._late = np.random.default_rng([seed, 58])
@@ -41,14 +41,14 @@ class Faults:
     def is_blacked_out(self, t_s: float) -> bool:
         """No features: fog, a lens cap, a camera that is off."""
         since = [t_s - at * self._duration_s for at in BLACKOUTS_AT]
-        return self._fault is Fault.BLACKOUT and any(0.0 <= s < BLACKOUT_S for s in since)
+        return self._fault is DrawnFault.BLACKOUT and any(0.0 <= s < BLACKOUT_S for s in since)
 
     def is_unmapped(self, t_s: float) -> bool:
-        return self._fault is Fault.DRIFT and t_s >= MAPPED_S
+        return self._fault is DrawnFault.DRIFT and t_s >= MAPPED_S
 
     def late_frames(self) -> int:
         """Delay of the match of this frame, in frames."""
-        return int(self._late.integers(MAX_LATE_FRAMES + 1)) if self._fault is Fault.LATE else 0
+        return int(self._late.integers(MAX_LATE_FRAMES + 1)) if self._fault is DrawnFault.LATE else 0
 
     def alter(self, match: MapMatch, shot: Shot) -> MapMatch:
         """The match that is published instead of ``match``."""
@@ -60,12 +60,12 @@ class Faults:
         wrong, distance_m = self._rng.uniform() < WRONG_SHARE, float(self._rng.uniform(*WRONG_M))
         towards = float(self._rng.uniform(0.0, 2.0 * math.pi))
         direction = np.array([math.sin(towards), math.cos(towards)])
-        if self._fault is Fault.WRONG and wrong and t_s >= QUIET_S:
+        if self._fault is DrawnFault.WRONG and wrong and t_s >= QUIET_S:
             return distance_m * direction
-        if self._fault is Fault.JUMPS and self._jumps_s and t_s >= self._jumps_s[0]:
+        if self._fault is DrawnFault.JUMPS and self._jumps_s and t_s >= self._jumps_s[0]:
             self._jumps_s.pop(0)
             return JUMP_M * direction
-        if self._fault is Fault.ROWS and 0.0 <= t_s - ROWS_AT * self._duration_s < ROWS_S:
+        if self._fault is DrawnFault.ROWS and 0.0 <= t_s - ROWS_AT * self._duration_s < ROWS_S:
             return self._row_m
         return None
 

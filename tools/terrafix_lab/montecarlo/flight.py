@@ -26,6 +26,10 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix.smoother.node import SmootherNode
+from terrafix_lab.faults.edits import Span
+from terrafix_lab.faults.table import FAULTS
+from terrafix_lab.montecarlo.edited import edited
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.faults import Faults
 from terrafix_lab.montecarlo.flown import Shot, fly
 from terrafix_lab.montecarlo.ground import MapError, Terrain
@@ -59,7 +63,7 @@ class Record:
     smoother_cpu_s: float = 0.0
     smoothed_error_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2); nan: not refined in flight
     smoothed_cov: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))  # (N, 2, 2) as published
-    lie_from_s: float | None = None  # start of the first false input; None: there is none
+    lie: Span | None = None  # of the first false input; None: there is none
     fixes: dict[str, int] = field(default_factory=dict)  # verdicts on map matches
 
 
@@ -71,6 +75,8 @@ def run(plan: FlightPlan, *, refine: bool = True) -> Record:
 class Run:
     def __init__(self, plan: FlightPlan) -> None:
         flown = fly(plan, Terrain(plan.seed, plan.hills_m, plan.settled))
+        if not isinstance(plan.fault, DrawnFault):
+            flown = edited(flown, FAULTS[plan.fault])
         self._plan, self._flown = plan, flown
         self._node, self._smoother = EstimatorNode(), SmootherNode()
         self._frame = LocalFrame(flown.origin.lat_deg, flown.origin.lon_deg)
@@ -97,7 +103,11 @@ class Run:
 
     def record(self, refine: bool) -> Record:
         plan, flown, record = self._plan, self._flown, self._record
-        lens = Lens(CameraCalibration.of(plan.camera), plan.focal_error, plan.k1_error)
+        described = flown.origin.camera
+        focal_error = plan.focal_error
+        if described.fx != plan.camera.fx:
+            focal_error = (1.0 + focal_error) * plan.camera.fx / described.fx - 1.0
+        lens = Lens(CameraCalibration.of(described), focal_error, plan.k1_error)
         sightings = SimulatedOdometry(lens, flown.terrain, plan.seed)
         matches = MapMatches(
             lens,
@@ -108,16 +118,17 @@ class Run:
             seed=plan.seed,
         )
         faults, lies = Faults(plan.fault, plan.duration_s, plan.seed), Lies(plan, flown)
-        record.lie_from_s = lies.start_s()
+        record.lie = lies.span()
         self._send(flown.origin)
         late: list[tuple[int, MapMatch]] = []  # frame at which it is published
         for i, shot in enumerate(flown.frames):
-            odometry = sightings.odometry(i, lies.picture(i), blind=faults.is_blacked_out(shot.t_s))
+            picture = lies.picture(i)
+            odometry = sightings.odometry(i, picture, blind=picture.dark or faults.is_blacked_out(shot.t_s))
             with self._stopwatch(record.cpu_ms, i):
                 for state in flown.telemetry[i]:
                     self._send(state)
                 published = self._send(odometry)
-            find = find_match(matches, faults, shot.t_s)
+            find = find_match(matches, faults, shot.t_s, dark=picture.dark)
             late += [
                 (i + faults.late_frames(), faults.alter(lies.match(i, prediction, find), shot))
                 for prediction in published
@@ -202,9 +213,9 @@ class Run:
         record.anchor_age_ms[i] = estimate.last_anchor_age_ms
 
 
-def find_match(matches: MapMatches, faults: Faults, t_s: float) -> FindMatch:
-    """The matches at ``t_s``: none in a blackout, or over ground that the map does not have."""
-    if faults.is_blacked_out(t_s):
+def find_match(matches: MapMatches, faults: Faults, t_s: float, *, dark: bool = False) -> FindMatch:
+    """The matches at ``t_s``: none of a ``dark`` picture, in a blackout, or over ground that the map does not have."""
+    if dark or faults.is_blacked_out(t_s):
         return partial(matches.no_match, verdict=Verdict.BAD_IMAGE)
     if faults.is_unmapped(t_s):
         return partial(matches.no_match, verdict=Verdict.FEW_INLIERS)

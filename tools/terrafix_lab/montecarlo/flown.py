@@ -12,7 +12,8 @@ from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import Imu, Message, Origin, VehicleState
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.faults.edits import Span
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.ground import Terrain
 from terrafix_lab.montecarlo.plan import FlightPlan
 from terrafix_lab.sim.autopilot.parameters import Kind
@@ -45,6 +46,17 @@ class Shot:
     r_w_c: np.ndarray  # (3, 3)
     r_w_b: np.ndarray  # (3, 3) of the body, or of the stabilised frame of a gimbal
     velocity_mps: np.ndarray  # (3,)
+    scale: tuple[float, float] = (1.0, 1.0)  # of the picture's content about its centre; negative: mirrored
+    dark: bool = False  # the picture shows nothing
+
+    def scaled(self, x: float, y: float) -> "Shot":
+        """The Sight of terrafix_lab/faults/pictures.py. Both axes mirrored are a camera turned about its axis."""
+        turn = np.diag([-1.0, -1.0, 1.0]) if x < 0.0 and y < 0.0 else np.eye(3)
+        sign = -1.0 if x < 0.0 and y < 0.0 else 1.0
+        return replace(self, r_w_c=self.r_w_c @ turn, scale=(sign * x * self.scale[0], sign * y * self.scale[1]))
+
+    def darkened(self) -> "Shot":
+        return replace(self, dark=True)
 
 
 @dataclass(frozen=True)
@@ -55,6 +67,7 @@ class SimulatedFlight:
     telemetry: list[list[Message]]  # before each frame
     path_m: np.ndarray  # (N,) flown over ground up to each frame
     terrain: Terrain  # in the estimator's local frame
+    lie: Span | None = None  # of a false input of the table of faults
 
     def at(self, t_s: float) -> Shot:
         """The truth at any time of the flight. Between frames: cubic Hermite position, constant angular rate."""
@@ -118,7 +131,7 @@ def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
         if i % frame_every == 0:
             frames.append(shot(state))
             pictures.append(replace(taken or frames[-1], t_s=state.t_s))
-            telemetry.append(waiting[-1:] if plan.fault is Fault.PHOTOS else waiting)
+            telemetry.append(waiting[-1:] if plan.fault is DrawnFault.PHOTOS else waiting)
             waiting = []
             paths_m.append(path_m)
         if lag and (i + lag) % frame_every == 0:

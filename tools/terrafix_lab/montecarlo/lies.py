@@ -11,7 +11,8 @@ import msgspec
 import numpy as np
 
 from terrafix.messages import MapMatch, Prediction, SearchResult, SearchStep, Verdict
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.faults.edits import Span
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.faults import no_match, wrong_match
 from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight
 from terrafix_lab.montecarlo.plan import FlightPlan
@@ -54,19 +55,19 @@ class Lies:
         self._turn_rad = float(rng.uniform(-math.pi, math.pi))
         self._pace, self._away_m = float(rng.uniform(*FOREIGN_PACE)), _random_offset_m(rng, FOREIGN_AWAY_M)
         self._rng, self._town_m = rng, _random_offset_m(rng, TOWN_AWAY_M)
-        self._search = Search() if plan.lies else None
+        self._search = Search() if plan.lies or flown.lie is not None else None
 
-    def start_s(self) -> float | None:
-        """Start of the first false input; None: there is none."""
+    def span(self) -> Span | None:
+        """Of the first false input, whose end is not known here if it is drawn; None: there is none."""
         if not self._lies:
-            return None
+            return self._flown.lie
         starts = {
-            Fault.FOREIGN: self._foreign_from,
-            Fault.FROZEN: self._frozen_from,
-            Fault.TOWN: self._town_from,
+            DrawnFault.FOREIGN: self._foreign_from,
+            DrawnFault.FROZEN: self._frozen_from,
+            DrawnFault.TOWN: self._town_from,
         }
         first = min(starts.get(lie, 0) for lie in self._lies)
-        return self._flown.frames[min(first, len(self._flown.frames) - 1)].t_s
+        return Span(self._flown.frames[min(first, len(self._flown.frames) - 1)].t_s, math.inf, "")
 
     def picture(self, i: int) -> Shot:
         """True pose of the content of frame ``i``, with its stated time."""
@@ -81,17 +82,17 @@ class Lies:
         found = find(prediction, shot, usable=self._search is None or not self._search.is_lost)
         if self._is_foreign(i):
             found = no_match(found)
-        if Fault.TOWN in self._lies and i >= self._town_from and found.verdict is not Verdict.BAD_IMAGE:
+        if DrawnFault.TOWN in self._lies and i >= self._town_from and found.verdict is not Verdict.BAD_IMAGE:
             return self._match_of_other_town(found, i)
         if self._search is None:
             return found
         return self._search.update(found, prediction, shot, find)
 
     def _is_foreign(self, i: int) -> bool:
-        return Fault.FOREIGN in self._lies and self._foreign_from <= i < self._foreign_to
+        return DrawnFault.FOREIGN in self._lies and self._foreign_from <= i < self._foreign_to
 
     def _is_frozen(self, i: int) -> bool:
-        return Fault.FROZEN in self._lies and self._frozen_from <= i < self._frozen_to
+        return DrawnFault.FROZEN in self._lies and self._frozen_from <= i < self._frozen_to
 
     def _foreign(self, shot: Shot) -> Shot:
         """Pose of another camera: the same trajectory, far away, rotated, and at another speed."""

@@ -116,7 +116,7 @@ class MapMatches:
         size = np.array([camera.width, camera.height])
         px = margin_px + rng.uniform(size=(count, 2)) * np.maximum(size - 2.0 * margin_px, 1.0)
         xy = camera.normalise(px)
-        rays = self._lens.rays(px) @ shot.r_w_c.T
+        rays = self._lens.showing(shot.scale).rays(px) @ shot.r_w_c.T
         places = shot.p_m[:2] + rays[:, :2] * (agl_m / np.maximum(-rays[:, 2:], 0.2))
         for _ in range(3):  # intersection of the ray with the ground plus MAP_SEES_TOPS of the objects on it
             up_m = self._terrain.bare_m(places) + MAP_SEES_TOPS * self._standing(places, PATCH_PER_AGL * agl_m)
@@ -170,6 +170,10 @@ class MapMatches:
         turn = log_so3(shot.r_w_c @ rot_from_quat(prediction.q_w_c).T)
         agl_true_m = float(shot.p_m[2]) - self._terrain.bare_at_m(float(shot.p_m[0]), float(shot.p_m[1]))
         scale_sigma = prediction.agl_sigma_m / max(agl_m, 1.0)
+        magnified = shot.scale[0] * shot.scale[1]  # both axes together; below zero: mirrored, which no map shows
+        if magnified < 0.0:
+            return False
+        agl_true_m /= math.sqrt(magnified)
         return bool(
             abs(turn[2]) < HYPOTHESES * math.sqrt(cov[5, 5]) + YAW_TOLERANCE_RAD
             and abs(agl_true_m / agl_m - 1.0) < HYPOTHESES * scale_sigma + SCALE_TOLERANCE

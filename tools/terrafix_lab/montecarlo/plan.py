@@ -8,7 +8,7 @@ import numpy as np
 
 from terrafix.map.format import CE90_SIGMAS
 from terrafix.messages import Camera
-from terrafix_lab.montecarlo.fault import LIES, Fault
+from terrafix_lab.montecarlo.fault import LIES, DrawnFault
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.vehicle.wind import Wind
 
@@ -32,18 +32,18 @@ FOCAL_SIGMA, K1_SIGMA = 0.01, 0.005  # of a lens with a single calibration or th
 
 # Faults of twelve successive flights. A third has none: their rates are those of ordinary operation.
 ROUND = (
-    Fault.NONE,
-    Fault.WRONG,
-    Fault.NONE,
-    Fault.BLACKOUT,
-    Fault.NONE,
-    Fault.HEIGHT,
-    Fault.LATE,
-    Fault.JUMPS,
-    Fault.COMPASS,
-    Fault.NONE,
-    Fault.ROWS,
-    Fault.DRIFT,
+    DrawnFault.NONE,
+    DrawnFault.WRONG,
+    DrawnFault.NONE,
+    DrawnFault.BLACKOUT,
+    DrawnFault.NONE,
+    DrawnFault.HEIGHT,
+    DrawnFault.LATE,
+    DrawnFault.JUMPS,
+    DrawnFault.COMPASS,
+    DrawnFault.NONE,
+    DrawnFault.ROWS,
+    DrawnFault.DRIFT,
 )
 
 
@@ -54,7 +54,7 @@ class FlightPlan:
     seed: int  # of all random numbers of this flight
     number: int
     kind: Kind
-    fault: Fault
+    fault: str  # a DrawnFault, or a row of the table of faults
     duration_s: float
     frame_hz: float
     agl_m: float
@@ -75,7 +75,7 @@ class FlightPlan:
     start_error_m: tuple[float, float]
     height_scale: float
     compass_rad: float | None  # constant error of the heading; None: drawn by the sensor model
-    lies: frozenset[Fault] = frozenset()  # of LIES
+    lies: frozenset[DrawnFault] = frozenset()  # of LIES
     picture_lag_s: float = 0.0  # age of each picture at its time stamp
 
 
@@ -83,7 +83,7 @@ def plan(
     run_seed: int,
     number: int,
     *,
-    fault: Fault | None = None,
+    fault: str | None = None,
     duration_s: float = DURATION_S,
     lie_share: float = 0.0,
 ) -> FlightPlan:
@@ -146,21 +146,21 @@ def _camera(width: int, height: int, focal_px: float, mount_tolerance_deg: float
 
 def _with_fault(drawn: FlightPlan, sign: float, rng: np.random.Generator) -> FlightPlan:
     """With the parameters that the fault of the flight changes. ``sign``: of an error of height or heading."""
-    changes: dict[Fault, dict[str, Any]] = {
-        Fault.HILLS: {"hills_m": 20.0, "has_dem": False},
-        Fault.PHOTOS: {"frame_hz": PHOTOS_HZ, "has_imu": False},
-        Fault.HEIGHT: {"height_scale": 1.0 + sign * 0.1},
-        Fault.COMPASS: {"compass_rad": sign * math.radians(float(rng.uniform(10.0, 15.0)))},
+    changes: dict[str, dict[str, Any]] = {
+        DrawnFault.HILLS: {"hills_m": 20.0, "has_dem": False},
+        DrawnFault.PHOTOS: {"frame_hz": PHOTOS_HZ, "has_imu": False},
+        DrawnFault.HEIGHT: {"height_scale": 1.0 + sign * 0.1},
+        DrawnFault.COMPASS: {"compass_rad": sign * math.radians(float(rng.uniform(10.0, 15.0)))},
     }
     return replace(drawn, **changes.get(drawn.fault, {}))
 
 
-def _lies(run_seed: int, number: int, chosen: Fault, share: float) -> frozenset[Fault]:
+def _lies(run_seed: int, number: int, chosen: str, share: float) -> frozenset[DrawnFault]:
     draws = np.random.default_rng([run_seed, number, 59]).uniform(size=len(LIES))
     return frozenset(lie for lie, draw in zip(LIES, draws.tolist(), strict=True) if draw < share or lie is chosen)
 
 
-def _with_lies(drawn: FlightPlan, lies: frozenset[Fault]) -> FlightPlan:
+def _with_lies(drawn: FlightPlan, lies: frozenset[DrawnFault]) -> FlightPlan:
     """With the false inputs that last for the whole flight; montecarlo/lies.py has the others."""
     rng = np.random.default_rng([drawn.seed, 60])
     scale = float(rng.choice(HEIGHT_SCALES))
@@ -168,12 +168,12 @@ def _with_lies(drawn: FlightPlan, lies: frozenset[Fault]) -> FlightPlan:
     turn_rad = math.radians(float(rng.choice([-90.0, 90.0, 180.0])))
     lag_s, towards = float(rng.uniform(*LAG_S)), float(rng.uniform(0.0, 2.0 * math.pi))
     start_error_m = (START_ERROR_M * math.sin(towards), START_ERROR_M * math.cos(towards))
-    changes: dict[Fault, dict[str, Any]] = {
-        Fault.SCALE: {"height_scale": scale},
-        Fault.FOCAL: {"focal_error": 1.0 / factor - 1.0},
-        Fault.HEADING: {"compass_rad": turn_rad},
-        Fault.STALE: {"picture_lag_s": lag_s},
-        Fault.START: {"start_sigma_m": START_SIGMA_M, "start_error_m": start_error_m},
+    changes: dict[DrawnFault, dict[str, Any]] = {
+        DrawnFault.SCALE: {"height_scale": scale},
+        DrawnFault.FOCAL: {"focal_error": 1.0 / factor - 1.0},
+        DrawnFault.HEADING: {"compass_rad": turn_rad},
+        DrawnFault.STALE: {"picture_lag_s": lag_s},
+        DrawnFault.START: {"start_sigma_m": START_SIGMA_M, "start_error_m": start_error_m},
     }
     changed = {name: value for lie in lies for name, value in changes.get(lie, {}).items()}
     return replace(drawn, lies=lies, **changed)

@@ -18,12 +18,16 @@ from rich.table import Table
 
 from terrafix.core.errors import OutputError, UsageError
 from terrafix.recorder.provenance import versions
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.faults.fault import check_flown_by, lacking
+from terrafix_lab.faults.table import FAULTS
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Record, run
 from terrafix_lab.montecarlo.picture import draw
 from terrafix_lab.montecarlo.plan import DURATION_S, plan
 from terrafix_lab.montecarlo.statistics import FlightResult, floors, summary
 
+COMMAND = "terrafix montecarlo --fault"  # of terrafix_lab.faults.fault.CAMPAIGNS
+FLYABLE = [name for name, fault in FAULTS.items() if not lacking(COMMAND, fault)]
 WORDS = {True: "holds", False: "BROKEN", None: "too few to judge"}  # of a floor
 TABLE_WIDTH = 130  # characters, also where the terminal is narrower or the output is a file
 RESULT, PICTURE = "montecarlo.json", "montecarlo.png"
@@ -39,9 +43,19 @@ class RunOptions:
     first: int = 0
     seed: int = 1
     duration_s: float = DURATION_S
-    fault: Fault | None = None
+    fault: str | None = None  # as of ``fault_of``
     lie_share: float = 0.0  # probability of each of LIES in a flight
     workers: int | None = None  # None: one per available processor
+
+
+def fault_of(name: str) -> str:
+    """A DrawnFault, or the name of a row of the table of faults. Raises UsageError."""
+    if name in list(DrawnFault):
+        return DrawnFault(name)
+    if name not in FAULTS:
+        raise UsageError(f"--fault '{name}': no such fault; known: {', '.join((*DrawnFault, *FLYABLE))}")
+    check_flown_by(COMMAND, FAULTS[name])
+    return name
 
 
 def montecarlo(options: RunOptions) -> dict[str, Any]:
@@ -112,7 +126,8 @@ def _fly_one(options: RunOptions, number: int) -> tuple[int, Record]:
 
 
 def _result(options: RunOptions, flights: list[FlightResult]) -> dict[str, Any]:
-    groups = {fault: [s for s in flights if fault in {s.record.plan.fault, *s.record.plan.lies}] for fault in Fault}
+    faults = dict.fromkeys((*DrawnFault, *(s.record.plan.fault for s in flights)))
+    groups = {fault: [s for s in flights if fault in {s.record.plan.fault, *s.record.plan.lies}] for fault in faults}
     total = summary(flights)
     return {
         "seed": options.seed,
@@ -195,6 +210,8 @@ def show(result: dict[str, Any], console: Console) -> None:
         f"{result['wall_s']:.0f} s",
         highlight=False,
     )
+    criteria = (f"{name}: {value}" for name, value in total["criteria"].items())
+    console.print("; ".join(criteria), highlight=False)
     shares = ", ".join(f"{name.replace('_', ' and ')} {share:.2f}" for name, share in total["parts"].items())
     console.print(f"squared error over claim, 1 when true: {shares}", highlight=False)
     for floor, holds in result["floors"].items():

@@ -182,7 +182,7 @@ class SimulatedOdometry:
 
     def _on_level_ground(self, px: np.ndarray, shot: Shot) -> np.ndarray:
         """(N, 3) where the rays of pixels (N, 2) meet a level plane at the height of the ground below the camera."""
-        rays = self._lens.rays(px) @ shot.r_w_c.T
+        rays = self._lens.showing(shot.scale).rays(px) @ shot.r_w_c.T
         ground_m = self._terrain.bare_at_m(float(shot.p_m[0]), float(shot.p_m[1]))
         reach = (shot.p_m[2] - ground_m) / np.maximum(-rays[:, 2], 0.2)
         return np.asarray(np.column_stack([shot.p_m[:2] + rays[:, :2] * reach[:, None], np.full(len(px), ground_m)]))
@@ -191,5 +191,5 @@ class SimulatedOdometry:
         """-> pixels (N, 2) of the scaled picture, and (N,) which of them lie in it."""
         in_c = (points_m - shot.p_m) @ shot.r_w_c
         ahead = in_c[:, 2] > 1.0
-        px = self._lens.project(np.where(ahead[:, None], in_c, (0.0, 0.0, 1.0)))
+        px = self._lens.showing(shot.scale).project(np.where(ahead[:, None], in_c, (0.0, 0.0, 1.0)))
         return px, ahead & ((px > 0.0) & (px < (self._camera.width, self._camera.height))).all(axis=1)

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Record
-from terrafix_tools.score import COVERAGE_FLOORS, INSIDE, coverage, is_false_fix, late_from_s, nees_band, nees_of
+from terrafix_lab.track import Track, measured
+from terrafix_tools.score import COVERAGE_FLOORS, INSIDE, coverage, nees_band, nees_of
 
 POSE95 = 12.592  # chi-square with 6 degrees of freedom, 95 %
 NORMAL95 = 1.959964  # two-sided
@@ -94,27 +95,22 @@ class FlightResult:
 
     @property
     def false_fixes(self) -> int:
-        return int(self._false().sum())
+        return int(self.track.is_false().sum())
 
     @property
     def notice_s(self) -> float | None:
         """From the start of the first false input to the last false fix after it; None: there is none of either."""
-        start_s, wrong = self.record.lie_from_s, self._false()
-        last_s = max(self.record.t_s[wrong].tolist(), default=-math.inf)
-        return last_s - start_s if start_s is not None and last_s >= start_s else None
+        return self.track.notice_s()
 
     @property
     def late_false_fixes(self) -> int:
         """False fixes but those at the beginning of the first false input, while nothing can show it yet."""
-        start_s, times_s = self.record.lie_from_s, self.record.t_s
-        if start_s is None:
-            return self.false_fixes
-        allowed = (times_s >= start_s) & (times_s <= late_from_s(times_s.tolist(), start_s))
-        return int((self._false() & ~allowed).sum())
+        return int(self.track.is_late().sum())
 
-    def _false(self) -> np.ndarray:
-        """(N,) bool"""
-        return is_false_fix(self.distance_m, self.nees)
+    @property
+    def track(self) -> Track:
+        sigma_m = np.sqrt(np.linalg.eigvalsh(self.record.cov[:, :2, :2])[:, 1])
+        return Track(self.record.t_s, self.distance_m, self.nees, sigma_m, self.record.lie)
 
     def refined_nees(self) -> np.ndarray:
         """(M,) of the frames that were refined."""
@@ -134,7 +130,7 @@ class FlightResult:
     def drift(self) -> float | None:
         """Error since the last map fix over the path since then; None for a flight with a map or a short path."""
         fixed = np.flatnonzero(self.record.anchor_age_ms == 0)
-        if self.record.plan.fault is not Fault.DRIFT or not len(fixed):
+        if self.record.plan.fault is not DrawnFault.DRIFT or not len(fixed):
             return None
         path_m = float(self.record.path_m[-1] - self.record.path_m[fixed[-1]])
         grown = self.record.error_m[-1, :2] - self.record.error_m[fixed[-1], :2]
@@ -179,6 +175,7 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
         "smoothed_median_m": float(np.median(smoothed_m)) if len(smoothed_m) else None,
         "false_fixes": sum(f.false_fixes for f in flights),
         "late_false_fixes": sum(f.late_false_fixes for f in flights),
+        "criteria": measured([f.track for f in flights]),
         "notice_s": max((f.notice_s for f in flights if f.notice_s is not None), default=None),
         "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
         "coverage": coverage(nees),

@@ -5,6 +5,7 @@ logs of 2015). Fields are those of AP_NavEKF3/LogStructure.h, AP_GPS/LogStructur
 AP_Logger/LogStructure.h."""
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +98,7 @@ def read_ardupilot(path: Path) -> AutopilotLog:
     attitude = _attitude(found.get("ATT", _EMPTY))
     if not attitude.t_s.size:
         raise SourceError(f"{path}: holds no attitude (ATT); set LOG_BITMASK to record it, or give another log")
-    firmware = _firmware(found.get("MSG", _EMPTY))
+    firmware = _firmware(found.get("MSG", _EMPTY).texts("Message"))
     prefix = next((p for p in _EKFS if len(found.get(f"{p}1", _EMPTY))), "XKF")
     origin = _origin(found)
     ekf = _tracks(found.get(f"{prefix}1", _EMPTY))
@@ -311,17 +312,25 @@ def _external_sets(parameters: Table) -> set[int]:
     return {n for n in (1, 2, 3) if values.get(f"EK3_SRC{n}_POSXY") == _EXTERNAL_NAVIGATION}
 
 
-def _firmware(texts: Table) -> str:
-    """The first text that names a vehicle: "ArduCopter V4.6.3 (...)"."""
-    for text in texts.texts("Message"):
-        if re.search(r"Copter|Plane|Rover|Sub|Blimp", text):
-            return text
-    return ""
+def named_firmware(texts: Iterable[str]) -> str:
+    """The first text that names a vehicle: "ArduCopter V4.6.3 (...)"; "" without one."""
+    return next((text for text in texts if re.search(r"(Copter|Plane|Rover|Sub|Blimp|Tracker) V\d", text)), "")
+
+
+def _firmware(texts: list[str]) -> str:
+    """The banner; else the first text that has the name of a vehicle."""
+    return named_firmware(texts) or next((t for t in texts if re.search(r"Copter|Plane|Rover|Sub|Blimp", t)), "")
+
+
+# ArduPilot's Blimp/mode.h; MAVLink has no enumeration of them.
+_BLIMP_MODES = {0: "land", 1: "manual", 2: "velocity", 3: "loiter", 4: "rtl"}
 
 
 def mode_name(firmware: str, number: int) -> str:
-    """Name of a flight mode, by the MAVLink enumeration of the vehicle."""
-    for vehicle in ("Copter", "Plane", "Rover"):
+    """Name of a flight mode, by the MAVLink enumeration of the vehicle; its number where the vehicle is not known."""
+    if "Blimp" in firmware:
+        return _BLIMP_MODES.get(number, f"mode {number}")
+    for vehicle in ("Copter", "Plane", "Rover", "Sub", "Tracker"):
         if vehicle in firmware:
             known = mavlink.enums[f"{vehicle.upper()}_MODE"].get(number)
             if known is not None and not known.name.endswith("ENUM_END"):
@@ -329,11 +338,19 @@ def mode_name(firmware: str, number: int) -> str:
     return f"mode {number}"
 
 
+def _modes(table: Table, firmware: str) -> list[str]:
+    """Logs of 2013 have a column Mode alone: a number in binary ones, the name in text."""
+    numbers = next((name for name in ("ModeNum", "Mode") if table.has(name)), "ModeNum")
+    if numbers == "Mode" and table.columns[numbers].dtype == object:
+        return [text.lower().replace("_", " ") for text in table.texts(numbers)]
+    return [mode_name(firmware, int(number)) for number in table.integers(numbers)]
+
+
 def _events(found: dict[str, Table], firmware: str) -> list[Event]:
     events = []
     modes = found.get("MODE", _EMPTY)
-    for t_s, number in zip(modes.t_s, modes.integers("ModeNum"), strict=True):
-        events.append(Event(float(t_s), "mode", mode_name(firmware, int(number))))
+    for t_s, mode in zip(modes.t_s, _modes(modes, firmware), strict=True):
+        events.append(Event(float(t_s), "mode", mode))
     noted = found.get("EV", _EMPTY)
     for t_s, number in zip(noted.t_s, noted.integers("Id"), strict=True):
         kind = "arming" if number in (ARMED, DISARMED) else "event"

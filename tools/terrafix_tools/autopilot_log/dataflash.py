@@ -5,6 +5,7 @@ names of a type (AP_Logger/LogStructure.h). Text: the same messages as lines "NA
 converted at once, so that a log of an hour takes a second. The reader of pymavlink (DFReader) takes twenty times as
 long and is under the GPL; a test compares both."""
 
+import re
 import struct
 from collections import Counter, defaultdict
 from collections.abc import Iterable
@@ -109,14 +110,35 @@ class DataFlash:
 
 
 def is_dataflash(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a DataFlash log, binary or text."""
-    return head[:3] == HEAD + bytes([FMT_TYPE]) or head.lstrip(b"\r\n ").startswith((b"FMT, 128,", b"FMT,128,"))
+    """Whether the first bytes of a file are those of a DataFlash log, binary or text. The first of them may be lost,
+    zero or foreign: a whole message FMT is enough."""
+    return _has_binary_format(head) or _has_text_format(head)
 
 
 def read_dataflash(path: Path, wanted: Iterable[str]) -> DataFlash:
     """Reads the messages of the ``wanted`` types. Raises OSError."""
     data = path.read_bytes()
-    return _read_binary(data, set(wanted)) if data[:2] == HEAD else _read_text(data, set(wanted))
+    return _read_binary(data, set(wanted)) if _has_binary_format(data) else _read_text(data, set(wanted))
+
+
+def _has_binary_format(data: bytes) -> bool:
+    """Whether a message FMT is in the data whose length is that of its format characters."""
+    begin = HEAD + bytes([FMT_TYPE])
+    at = data.find(begin)
+    while at >= 0:
+        if at + FMT_LENGTH <= len(data) and _stated_format(data, at) is not None:
+            return True
+        at = data.find(begin, at + 1)
+    return False
+
+
+def _has_text_format(data: bytes) -> bool:
+    """Whether a line FMT is in the data with number and length of a message and known format characters."""
+    for line in re.findall(rb"^FMT,[ \d]+,[ \d]+,[^\r\n]+", data, re.MULTILINE):
+        cells = [cell.strip() for cell in line.decode("latin-1").split(",", 5)]
+        if len(cells) == 6 and _format(cells[3], cells[4], cells[5].replace(" ", "")) is not None:
+            return True
+    return False
 
 
 def _read_binary(data: bytes, wanted: set[str]) -> DataFlash:
@@ -159,14 +181,20 @@ def _scan(data: bytes) -> tuple[dict[int, Format], dict[int, list[int]], int]:
             at = following
             continue
         if kind == FMT_TYPE:
-            number, stated, *texts = _FMT.unpack_from(data, at + 3)
-            layout = _format(*(text.split(b"\0")[0].decode("latin-1") for text in texts))
-            if layout is not None and layout.dtype().itemsize + 3 == stated:
-                formats[number], lengths[number] = layout, stated
+            stated = _stated_format(data, at)
+            if stated is not None:
+                number, formats[number], lengths[number] = stated
         offsets[kind].append(at)
         at += length
     formats.setdefault(FMT_TYPE, Format("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns")))
     return formats, dict(offsets), skipped + size - at
+
+
+def _stated_format(data: bytes, at: int) -> tuple[int, Format, int] | None:
+    """(type, format, length) that the message FMT at ``at`` states; None: not known, or of another length."""
+    number, length, *texts = _FMT.unpack_from(data, at + 3)
+    layout = _format(*(text.split(b"\0")[0].decode("latin-1") for text in texts))
+    return (number, layout, length) if layout is not None and layout.dtype().itemsize + 3 == length else None
 
 
 def _format(name: str, characters: str, columns: str) -> Format | None:
@@ -179,7 +207,8 @@ def _format(name: str, characters: str, columns: str) -> Format | None:
 def _converted(values: np.ndarray, character: str) -> np.ndarray:
     if values.dtype.kind == "S":
         return np.array([text.split(b"\0")[0].decode("utf-8", "replace") for text in values.tolist()], dtype=object)
-    return values.astype(np.float64) / _CHARACTERS[character][1]
+    with np.errstate(invalid="ignore"):  # damaged bytes are any float
+        return values.astype(np.float64) / _CHARACTERS[character][1]
 
 
 def _read_text(data: bytes, wanted: set[str]) -> DataFlash:
@@ -220,15 +249,15 @@ def _read_text(data: bytes, wanted: set[str]) -> DataFlash:
 
 
 def _numbers(cells: list[str], character: str) -> np.ndarray:
-    """Numbers, or texts where the column has texts ("n", "N", "Z", and "M": the name of a mode)."""
-    if character in "nNZ":
+    """Numbers, or texts where the column has texts ("n", "N", "Z", and "M" where it has the names of modes)."""
+    if character in "nNZ" or (character == "M" and not all(cell.isdecimal() for cell in cells)):
         return np.array(cells, dtype=object)
     found = np.full(len(cells), np.nan)
     for i, cell in enumerate(cells):
         try:
             found[i] = float(cell)
         except ValueError:
-            continue  # the name of a mode, or a damaged line
+            continue  # a damaged line
     return found
 
 
@@ -237,14 +266,18 @@ def _tables(parts: dict[str, tuple[Format, dict[str, np.ndarray], np.ndarray]]) 
     timed = [(parts[name][2], t_s) for name, t_s in times.items() if t_s is not None]
     places = np.concatenate([order for order, _ in timed]) if timed else np.zeros(0)
     clock = np.concatenate([t_s for _, t_s in timed]) if timed else np.zeros(0)
+    others_timed = any(t_s is not None for name, t_s in times.items() if name not in ("GPS", "GPS2"))
     by_place = np.argsort(places, kind="stable")
     places, clock = places[by_place], clock[by_place]
     tables = {}
     for name, (layout, columns, order) in parts.items():
         t_s = times[name]
-        if t_s is None:
-            before = np.searchsorted(places, order) - 1
-            t_s = clock[np.maximum(before, 0)] if len(clock) else np.full(len(order), np.nan)
+        if t_s is None and not len(clock):
+            t_s = np.full(len(order), np.nan)
+        elif t_s is None and not others_timed:  # logs of 2013: the GPS alone has a time
+            t_s = np.interp(order, places, clock)
+        elif t_s is None:
+            t_s = clock[np.maximum(np.searchsorted(places, order) - 1, 0)]
         tables[name] = Table(columns, dict(zip(layout.columns, layout.characters, strict=True)), order, t_s)
     return tables
 
@@ -253,6 +286,8 @@ def _times(name: str, columns: dict[str, np.ndarray]) -> np.ndarray | None:
     """Seconds since the start of the autopilot; None: the message has no time."""
     if "TimeUS" in columns:
         return columns["TimeUS"] * 1e-6
-    if name in ("GPS", "GPS2") and "T" in columns:  # in old logs TimeMS of a GPS is that of the GPS week
-        return columns["T"] * 1e-3
+    if name in ("GPS", "GPS2"):  # in old logs TimeMS of a GPS is that of the GPS week, in those of 2013 Time, too
+        for column in ("T", "Time"):
+            if column in columns:
+                return columns[column] * 1e-3
     return columns["TimeMS"] * 1e-3 if "TimeMS" in columns else None

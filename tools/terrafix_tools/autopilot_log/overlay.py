@@ -36,7 +36,7 @@ def overlay(flight: Flight, log: AutopilotLog) -> dict[str, Any]:
     window = _Window(clock, from_s, to_s)
     return {
         "record": str(flight.path),
-        "log": {"path": str(log.path), "kind": log.kind, "firmware": log.firmware},
+        "log": {"path": str(log.path), "kind": log.kind, "firmware": log.firmware, "notes": log.notes},
         "duration_s": round(flight.end_s, 3),
         "from_s": round(from_s, 3),
         "to_s": round(to_s, 3),

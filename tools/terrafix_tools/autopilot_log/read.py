@@ -7,13 +7,14 @@ from terrafix.core.mavlink.tlog import is_tlog
 from terrafix_tools.autopilot_log.dataflash import is_dataflash
 from terrafix_tools.autopilot_log.structure import AutopilotLog
 
-_HEAD_BYTES = 64
+_HEAD_BYTES = 256 * 1024  # in which a record is searched: a log may begin with lost or foreign bytes
 _ULOG_MAGIC = b"ULog"
 SUFFIXES = (".bin", ".log", ".tlog", ".ulg")
 
 
-def read_autopilot_log(path: Path) -> AutopilotLog:
-    """Raises SourceError: no such file, empty, no log of an autopilot, or one without attitude."""
+def read_autopilot_log(path: Path, system_id: int = 0) -> AutopilotLog:
+    """``system_id``: the vehicle of a telemetry log with several; 0: the only one that moves. Raises SourceError: no
+    such file, empty, no log of an autopilot, or one without attitude."""
     head = _head(path)
     if not head:
         raise SourceError(f"{path}: is empty; copy the log from the autopilot again")
@@ -28,7 +29,11 @@ def read_autopilot_log(path: Path) -> AutopilotLog:
     if is_tlog(head) or path.suffix.lower() == ".tlog":  # a telemetry log may begin with a damaged record
         from terrafix_tools.autopilot_log.telemetry import read_telemetry
 
-        return read_telemetry(path)
+        return read_telemetry(path, system_id)
+    if path.suffix.lower() in (".bin", ".log") and is_dataflash(path.read_bytes()):  # more than the head is lost
+        from terrafix_tools.autopilot_log.ardupilot import read_ardupilot
+
+        return read_ardupilot(path)
     raise SourceError(
         f"{path}: is no log of an autopilot; give ArduPilot's .bin or .log, a .tlog of a ground station, or PX4's .ulg"
     )

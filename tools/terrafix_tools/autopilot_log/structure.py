@@ -155,6 +155,7 @@ class AutopilotLog:
     events: list[Event] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)  # messages in the file, by type
     skipped_bytes: int = 0  # damaged or cut off
+    notes: list[str] = field(default_factory=list)  # what was repaired, chosen and left out, in words
 
     @property
     def span_s(self) -> tuple[float, float]:

@@ -14,8 +14,9 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import SourceError
-from terrafix.core.mavlink.tlog import read_messages
-from terrafix_tools.autopilot_log.ardupilot import mode_name
+from terrafix.core.mavlink.tlog import TelemetryLog
+from terrafix.core.mavlink.vehicles import PX4, firmware_of
+from terrafix_tools.autopilot_log.ardupilot import mode_name, named_firmware
 from terrafix_tools.autopilot_log.structure import (
     Attitude,
     AutopilotLog,
@@ -43,14 +44,6 @@ _WANTED = {
     mavlink.MAVLINK_MSG_ID_STATUSTEXT,
 }
 _REBOOT_S = 1.0  # a step back of the time since the start that is more than packets out of order
-_COPTERS = {  # MAV_TYPE
-    mavlink.MAV_TYPE_QUADROTOR,
-    mavlink.MAV_TYPE_HELICOPTER,
-    mavlink.MAV_TYPE_HEXAROTOR,
-    mavlink.MAV_TYPE_OCTOROTOR,
-    mavlink.MAV_TYPE_TRICOPTER,
-    mavlink.MAV_TYPE_COAXIAL,
-}
 # Main mode of PX4's custom_mode, and its sub-modes of "auto" (px4_custom_mode.h)
 _PX4_MODES = {1: "manual", 2: "altitude", 3: "position", 4: "auto", 5: "acro", 6: "offboard", 7: "stabilized"}
 _PX4_AUTO = 4
@@ -71,22 +64,24 @@ _RATIOS = {  # field of EKF_STATUS_REPORT, ESTIMATOR_STATUS -> test ratio; both 
 _Timed = list[tuple[float, Any]]  # arrival [s], message
 
 
-def read_telemetry(path: Path) -> AutopilotLog:
-    """Raises SourceError when the file cannot be read, is no telemetry log, or has no attitude."""
-    t0_us, messages = read_messages(path, _WANTED, dialect=mavlink)
+def read_telemetry(path: Path, system_id: int = 0) -> AutopilotLog:
+    """``system_id``: the vehicle to read; 0: the only one, or the only one that moves. Raises SourceError when the file
+    cannot be read, is no telemetry log, has no such vehicle, or has no attitude of it."""
+    records = TelemetryLog(path, system_id=system_id, dialect=mavlink)
     found: defaultdict[str, _Timed] = defaultdict(list)
-    for t_us, message in messages:
-        found[message.get_type()].append(((t_us - t0_us) * 1e-6, message))
+    for t_us, message in records.messages(_WANTED):
+        found[message.get_type()].append(((t_us - records.t0_us) * 1e-6, message))
     received = found["ATTITUDE"]
     t_s = _measured_s(received) if received else np.zeros(0)
     attitude = cleaned(Attitude(t_s, *_columns(received, "roll", "pitch", "yaw")))
     if not attitude.t_s.size:
         raise SourceError(f"{path}: holds no attitude of an autopilot (ATTITUDE); give another log")
+    firmware = _firmware(found["HEARTBEAT"], found["STATUSTEXT"])
     return AutopilotLog(
         path=path,
         kind="MAVLink telemetry",
         attitude=attitude,
-        firmware=_firmware(found["HEARTBEAT"]),
+        firmware=firmware,
         rates=BodyRates(t_s, np.stack(_columns(received, "rollspeed", "pitchspeed", "yawspeed"), axis=1)),
         position=_position(found["GLOBAL_POSITION_INT"]),
         origin=_origin(found["GPS_GLOBAL_ORIGIN"]),
@@ -98,8 +93,12 @@ def read_telemetry(path: Path) -> AutopilotLog:
             if (track := _receiver(instance, found[name])) is not None
         ],
         fusion=_fusion(found["EKF_STATUS_REPORT"]),
-        events=sorted([*_states(found["HEARTBEAT"]), *_texts(found["STATUSTEXT"])], key=lambda event: event.t_s),
+        events=sorted(
+            [*_states(found["HEARTBEAT"], firmware), *_texts(found["STATUSTEXT"])], key=lambda event: event.t_s
+        ),
         counts=Counter({name: len(of) for name, of in found.items() if of}),
+        skipped_bytes=records.skipped_bytes,
+        notes=records.notes(),
     )
 
 
@@ -180,33 +179,30 @@ def _fusion(timed: _Timed) -> list[Fusion]:
     return [Fusion(name, t_s, (flags & bit) > 0) for name, bit in names.items()]
 
 
-def _vehicle(heartbeat: Any) -> str:
-    if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_PX4:
-        return "PX4"
-    if heartbeat.type in _COPTERS:
-        return "ArduCopter"
-    return "Rover" if heartbeat.type == mavlink.MAV_TYPE_GROUND_ROVER else "ArduPlane"
+def _firmware(heartbeats: _Timed, texts: _Timed) -> str:
+    """By the autopilot's own banner ("ArduPlane V4.5.7"), since a quadplane may state any type of vehicle; else by
+    the type that its first heartbeat states."""
+    banner = named_firmware([event.text for event in _texts(texts)])
+    heartbeat = heartbeats[0][1] if heartbeats else None
+    known = "" if heartbeat is None else firmware_of(heartbeat.autopilot, heartbeat.type)
+    return known if known == "PX4" or not banner else banner
 
 
-def _firmware(timed: _Timed) -> str:
-    return _vehicle(timed[0][1]) if timed else ""
-
-
-def _mode(heartbeat: Any) -> str:
-    if heartbeat.autopilot != mavlink.MAV_AUTOPILOT_PX4:
-        return mode_name(_vehicle(heartbeat), heartbeat.custom_mode)
+def _mode(heartbeat: Any, firmware: str) -> str:
+    if heartbeat.autopilot != PX4:
+        return mode_name(firmware, heartbeat.custom_mode)
     main, sub = heartbeat.custom_mode >> 16 & 0xFF, heartbeat.custom_mode >> 24 & 0xFF
     if main == _PX4_AUTO and sub in _PX4_AUTO_MODES:
         return _PX4_AUTO_MODES[sub]
     return _PX4_MODES.get(main, f"mode {main}.{sub}")
 
 
-def _states(timed: _Timed) -> Iterator[Event]:
+def _states(timed: _Timed, firmware: str) -> Iterator[Event]:
     """Modes and arming, at each change."""
     mode, armed = "", False
     for t_s, heartbeat in timed:
         now_armed = bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        if (now_mode := _mode(heartbeat)) != mode:
+        if (now_mode := _mode(heartbeat, firmware)) != mode:
             yield Event(t_s, "mode", now_mode)
         if now_armed != armed:
             yield Event(t_s, "arming", "armed" if now_armed else "disarmed")

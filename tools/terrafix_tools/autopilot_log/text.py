@@ -32,6 +32,7 @@ def as_json(log: AutopilotLog) -> dict[str, Any]:
         "fused": [fusion.name for fusion in log.fusion],
         "events": len(log.events),
         "skipped_bytes": log.skipped_bytes,
+        "notes": log.notes,
         "messages": dict(sorted(log.counts.items())),
     }
 
@@ -51,12 +52,14 @@ def info_lines(log: AutopilotLog) -> Iterator[str]:
         yield f"  {name:<32} {count:>8}  {count / duration_s if duration_s > 0 else 0.0:8.2f} Hz"
     if log.skipped_bytes:
         yield f"{log.skipped_bytes} bytes are damaged or cut off: left out"
+    yield from log.notes
 
 
 def summary(found: dict[str, Any]) -> Iterator[str]:
     """Lines of an overlay for a terminal."""
     of_log = found["log"]
     yield f"{of_log['path']}: {of_log['kind']}, {of_log['firmware'] or 'unknown firmware'}"
+    yield from of_log["notes"]
     yield f"covers {found['from_s']:.1f} to {found['to_s']:.1f} s of {found['duration_s']:.1f} s of the record"
     yield clock_line(found["clock"])
     for receiver in found["gps"]:

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources.description import Description, read_description
-from terrafix.vision.sources.images import IMAGE_SUFFIXES
+from terrafix.vision.sources.images import image_files
 from terrafix_tools.console.payloads import NewFlight
 from terrafix_tools.mission.file import read_mission
 
@@ -60,7 +60,7 @@ def images_of(folder: Path, first: int | None) -> list[tuple[str, Path]]:
     """Names and files of the images of a folder, in the order of their names. ``first``: they get numbers from there;
     None: names are as they are. Raises SourceError."""
     try:
-        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+        paths = image_files(folder)
     except OSError as error:
         raise SourceError(f"{folder}: cannot be read ({error.strerror})") from None
     if first is None:

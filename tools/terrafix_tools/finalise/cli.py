@@ -13,7 +13,7 @@ def finalise(
     """After landing: smooths the whole flight at once; writes finalised.csv and finalised.json beside the record."""
     from rich.console import Console
 
-    from terrafix_tools.finalise.before_after import table
+    from terrafix_tools.before_after import table
     from terrafix_tools.finalise.run import finalise as run_finalise
     from terrafix_tools.finalise.run import last_lines
 

@@ -25,13 +25,13 @@ from terrafix.messages import Frame, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import versions
 from terrafix.recorder.reader import ReadResult, check_format, read_flight
+from terrafix_tools.before_after import FINALISED, REFINED, Change, kept_line
 from terrafix_tools.estimates import NS
 from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
-from terrafix_tools.finalise.before_after import FINALISED, REFINED, Change, kept_line
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, Choice, Comparison, choose
-from terrafix_tools.finalise.output import TABLE, FinalRow, write
 from terrafix_tools.finalise.point_cloud import POINTS, VERTEX, cloud_name, write_ply
+from terrafix_tools.finalised import TABLE, FinalRow, write
 
 # Messages that the estimator subscribes to. SourceEnded is left out: it starts the estimator's own refinement.
 REPLAYED = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.subscribes if t is not SourceEnded)

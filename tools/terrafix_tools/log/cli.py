@@ -16,6 +16,9 @@ OutArgument = Annotated[Path, typer.Argument(help="Record to write (.mcap).")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 FromOption = Annotated[float, typer.Option("--from", help="Seconds since the start of the flight.")]
 ToOption = Annotated[float, typer.Option("--to", help="Seconds since the start of the flight.")]
+SystemOption = Annotated[
+    int, typer.Option("--system", help="MAVLink system id of the vehicle, of a .tlog with several.")
+]
 DAMAGED = 1  # exit code
 
 
@@ -23,6 +26,7 @@ DAMAGED = 1  # exit code
 def info(
     record: Annotated[Path, typer.Argument(help="Record, folder of replay or run, or an autopilot's own log.")],
     json_only: JsonOption = False,
+    system: SystemOption = 0,
 ) -> None:
     """What is in a record: files, versions, duration, frames, messages with their rates. Or in an autopilot's log."""
     from terrafix_tools.autopilot_log.read import is_autopilot_log, read_autopilot_log
@@ -31,7 +35,7 @@ def info(
     if is_autopilot_log(record):
         from terrafix_tools.autopilot_log import text
 
-        log = read_autopilot_log(record)
+        log = read_autopilot_log(record, system)
         about, lines = text.as_json(log), text.info_lines(log)
     else:
         from terrafix_tools.log import contents
@@ -47,6 +51,7 @@ def autopilot(
     log: Annotated[Path, typer.Argument(help="Its autopilot's log: ArduPilot .bin or .log, .tlog, PX4 .ulg.")],
     json_only: JsonOption = False,
     out: Annotated[Path | None, typer.Option(help="Also write an HTML page.")] = None,
+    system: SystemOption = 0,
 ) -> None:
     """The autopilot's own log on the time of a record: what its EKF fused, innovations, receivers, lanes, modes.
 
@@ -57,7 +62,7 @@ def autopilot(
     from terrafix_tools.autopilot_log.read import read_autopilot_log
     from terrafix_tools.autopilot_log.text import summary
 
-    found = overlay(read_flight_side(record), read_autopilot_log(log))
+    found = overlay(read_flight_side(record), read_autopilot_log(log, system))
     if out is not None:
         try:
             out.write_text(page(found), encoding="utf-8")

@@ -30,11 +30,11 @@ from terrafix.map.format import (
 from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
+from terrafix_tools.mapping.choices import Descriptors
 from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
 from terrafix_tools.mapping.mosaic.accuracy import add_accuracy_estimates
 from terrafix_tools.mapping.mosaic.collar import find_collar
 from terrafix_tools.mapping.package.dem import TILES_PER_WORKER, DemSource, height_places, open_heights, write_elevation
-from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
 from terrafix_tools.mapping.package.descriptors import write_descriptors
 from terrafix_tools.mapping.package.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.package.null_model import add_null_models

@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from terrafix_tools.mapping import cli_mosaic, cli_package
-from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
-from terrafix_tools.mapping.package.height_datums import Datum
+from terrafix_tools.mapping.choices import Datum, Descriptors
 
 app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
 

@@ -12,6 +12,7 @@ from terrafix.core.errors import TerrafixError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.signature import trusted_keys
 from terrafix.health.sysfs import read_disk_free_mb, read_throttling, read_zones
+from terrafix.health.zones import deciding_zones
 from terrafix.link.output import gps_time
 from terrafix.map.package import MapPackage
 from terrafix.vision.sources import open_configured, parse_start
@@ -44,7 +45,7 @@ def check_lines(config: Config, mission: Path | None, out: Path) -> Iterator[Lin
         yield _correlation(config)
     yield _clock()
     yield _disk(config, out)
-    yield _temperature(config)
+    yield temperature_line(config)
 
 
 def _map(config: Config, mission: Path | None) -> Iterator[Line]:
@@ -195,7 +196,7 @@ def _disk(config: Config, out: Path) -> Line:
     return ok("disk", f"{free_mb} MB free in {folder}")
 
 
-def _temperature(config: Config) -> Line:
+def temperature_line(config: Config) -> Line:
     thermal = Path(config.health.sysfs_root) / "class" / "thermal"
     zones, throttling = read_zones(thermal), read_throttling(thermal)
     if throttling:
@@ -204,8 +205,12 @@ def _temperature(config: Config) -> Line:
         return warn(
             "temperature", f"no zone can be read in {thermal}", "heat will not be noticed; set [health] sysfs_root"
         )
-    hottest = max(zones, key=lambda zone: zone.temperature_c)
-    text = f"{hottest.temperature_c:.0f} C ({hottest.name})"
+    deciding, left_out = deciding_zones(zones, config.health.zones)
+    if not deciding:
+        names = ", ".join(zone.name for zone in zones)
+        return warn("temperature", f"none of [health] zones is readable in {thermal}", f"choose among: {names}")
+    hottest = max(deciding, key=lambda zone: zone.temperature_c)
+    text = "; ".join([f"{hottest.temperature_c:.0f} C ({hottest.name})", *left_out])
     if hottest.temperature_c >= config.health.hot_c:
         return warn("temperature", f"{text}, on the ground already", "let it cool, and check the fan")
     return ok("temperature", text)

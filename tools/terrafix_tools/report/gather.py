@@ -30,9 +30,9 @@ from terrafix.messages import (
 from terrafix.recorder.reader import ReadResult, read_received
 from terrafix_tools.estimates import ESTIMATES, NS, PARTIAL, RowTable, read_rows
 from terrafix_tools.evaluate import compare, metrics, read_summary, read_truth, truth_sigma_of
-from terrafix_tools.finalise.output import SUMMARY as FINALISED_SUMMARY
-from terrafix_tools.finalise.output import TABLE as FINALISED
-from terrafix_tools.finalise.output import read_flights, read_track
+from terrafix_tools.finalised import SUMMARY as FINALISED_SUMMARY
+from terrafix_tools.finalised import TABLE as FINALISED
+from terrafix_tools.finalised import read_flights, read_track
 from terrafix_tools.log.contents import Contents
 from terrafix_tools.report.data import FlightView, RejectedMatch
 from terrafix_tools.report.innovations import Innovations

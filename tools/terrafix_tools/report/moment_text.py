@@ -12,6 +12,7 @@ T = TypeVar("T")
 VERDICTS = {
     Verdict.ACCEPTED: "accepted",
     Verdict.BAD_IMAGE: "the picture is unreadable",
+    Verdict.OVERTAKEN: "left out, the computer was too slow",
     Verdict.STALLED: "the camera repeats an earlier picture",
     Verdict.NO_FEATURES: "nothing in the picture to follow",
     Verdict.FEW_INLIERS: "too few matches agree with one motion or pose",

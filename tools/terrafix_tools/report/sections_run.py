@@ -6,7 +6,7 @@ from html import escape
 
 import numpy as np
 
-from terrafix_tools.finalise.before_after import HEADER, Change, kept_line
+from terrafix_tools.before_after import HEADER, Change, kept_line
 from terrafix_tools.report import document
 from terrafix_tools.report.charts import HALF_WIDTH, Chart, clock
 from terrafix_tools.report.data import FlightView, radius95_m
@@ -112,13 +112,14 @@ def camera_images(view: FlightView) -> str:
 
 
 def provenance(view: FlightView) -> str:
-    """Versions, map and configuration."""
+    """Versions, map, what the source says of itself, and configuration."""
     versions = view.header.get("versions", {}) or view.summary.get("versions", {})
     rows = [(name, str(value)) for name, value in versions.items() if value]
     chart = view.summary.get("map", {})
     rows += [(f"map {key}", str(chart[key])) for key in ("path", "date", "gsd_m", "checksum") if chart.get(key)]
+    rows += [(f"source, {topic}", text) for topic, text in view.header.get("source", [])]
     config = json.dumps(view.header.get("config", view.summary.get("config", {})), indent=2)
     return (
-        f"<h2>Provenance</h2><details><summary>Versions, map and configuration</summary>{table(rows)}"
+        f"<h2>Provenance</h2><details><summary>Versions, map, source and configuration</summary>{table(rows)}"
         f"<pre>{escape(config)}</pre></details>"
     )

@@ -1,11 +1,12 @@
-"""Telemetry logs (.tlog) of a ground station: MAVLink packets with their arrival times.
+"""Telemetry logs (.tlog) of a ground station: MAVLink packets with their arrival times (``log_records``).
 
-Format: a record is 8 bytes, big endian, microseconds since 1970, followed by one packet (MAVLink 1 or 2), as Mission
-Planner, QGroundControl and MAVProxy write it. Attitude, height, airspeed and IMU are read. GNSS position and velocity
-are not read."""
+Attitude, height, airspeed and IMU of one vehicle are read. GNSS position and velocity are not read. Jumps of the
+logging computer's clock are repaired (``log_clock``)."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,17 @@ from pymavlink.dialects.v20 import common as mavlink
 from terrafix.core.errors import SourceError
 from terrafix.core.mavlink.airspeed import AirspeedReader
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
-from terrafix.core.mavlink.imu import ImuStreamSelector, boot_ns, imu_readings
+from terrafix.core.mavlink.imu import MAX_BOOT_US, ImuStreamSelector, boot_ns, imu_readings
+from terrafix.core.mavlink.log_clock import Jump, repaired
+from terrafix.core.mavlink.log_records import address, payload, read_records, record, sequence
+from terrafix.core.mavlink.vehicles import ARMED_FLAG, HeardVehicle, choose_vehicle, firmware_of
 from terrafix.messages import Imu, ImuSample, VehicleState
 
+__all__ = ["TelemetryLog", "is_tlog", "read_imu", "read_tlog", "record"]
+
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1; a tlog also holds messages of the ground station and the gimbal
-MAX_STEP_US = 24 * 3600 * 1_000_000  # a record more than a day after or before the last one is corrupt data
-MIN_TIME_US = 946_684_800_000_000  # 2000-01-01; an earlier time stamp is invalid
 IMU_BATCH_NS = 100_000_000  # duration of the samples in one Imu message
-_STAMP = 8  # bytes of the time stamp
+CRC_EXTRA = {number: int(kind.crc_extra) for number, kind in mavlink.mavlink_map.items()}
 _STATES = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT,
     mavlink.MAVLINK_MSG_ID_ATTITUDE,
@@ -36,19 +40,206 @@ _INERTIAL = {
     mavlink.MAVLINK_MSG_ID_SCALED_IMU,
     mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
 }
+# Bytes of the payload with the time since the start of the autopilot, and its unit in microseconds.
+_BOOT_TIMES: dict[int, tuple[int, int, int]] = {
+    **dict.fromkeys(
+        (
+            mavlink.MAVLINK_MSG_ID_ATTITUDE,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+            mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+            mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+            mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
+            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
+            mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
+        ),
+        (0, 4, 1000),
+    ),
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: (8, 12, 1000),
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: (0, 8, 1),
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: (0, 8, 1),
+}
 # In order of preference. VFR_HUD.alt is above sea level, so it is used relative to the first record, taken as ground.
 _HEIGHTS = ("GLOBAL_POSITION_INT", "ALTITUDE", "VFR_HUD")
 
 _TimedReadings = tuple[int, int, tuple[float, ...]]  # arrival time [ns], boot time [ns], readings (imu_readings)
 
 
-def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
-    """States in time order. ``t_ns`` is relative to ``t0_us`` (UNIX microseconds), or to the first record.
+class TelemetryLog:
+    """A log, read once. ``t0_us``: UNIX time of its zero in microseconds; default: the first record. ``system_id``: the
+    vehicle to read; 0: the only one, or the only one that moves.
 
-    One state for each ATTITUDE (yaw, pitch, roll), each AIRSPEED, and each height message of the preferred type in the
-    log. Truncated and corrupt records are skipped. Raises SourceError when the file cannot be read or holds no
-    record."""
-    t0_us, messages = read_messages(path, _STATES, t0_us)
+    Damaged and cut off records are left out. Raises SourceError when the file cannot be read, holds no record, does not
+    have the vehicle, or has several that could be meant."""
+
+    def __init__(self, path: Path, t0_us: int | None = None, system_id: int = 0, dialect: Any = mavlink) -> None:
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise SourceError(f"{path}: cannot be read ({error.strerror})") from None
+        crc_extra = CRC_EXTRA if dialect is mavlink else {n: int(k.crc_extra) for n, k in dialect.mavlink_map.items()}
+        found = read_records(data, crc_extra)
+        if not found.packets:
+            raise SourceError(f"{path}: holds no MAVLink record; is it a telemetry log (.tlog)?")
+        self.path, self._dialect = path, dialect
+        self._packets, self.skipped_bytes = found.packets, found.skipped_bytes
+        self._addresses = [address(packet) for packet in found.packets]
+        self.vehicles = self._heard()
+        self.choice = choose_vehicle(self.vehicles, system_id)
+        self._check_choice(system_id)
+        self.system_id = self.choice.vehicle.system_id if self.choice.vehicle else 0
+        clock = repaired(found.stamps_us, self._boot_times_us(), self._numbers())
+        self.jumps, self.damaged_stamps = clock.jumps, clock.damaged_stamps
+        self._times_us = clock.times_us
+        self.t0_us = clock.times_us[0] if t0_us is None else t0_us
+
+    def messages(self, wanted: set[int]) -> Iterator[tuple[int, Any]]:
+        """(time [us since 1970], message) for all ``wanted`` message ids of the vehicle's autopilot."""
+        for t_us, packet, (system_id, component_id, message_id) in zip(
+            self._times_us, self._packets, self._addresses, strict=True
+        ):
+            if component_id == AUTOPILOT_COMPONENT and system_id == self.system_id and message_id in wanted:
+                message = self._decoded(packet)
+                if message is not None:
+                    yield t_us, message
+
+    @cached_property
+    def states(self) -> list[VehicleState]:
+        """States in time order; ``t_ns`` from the zero of the log.
+
+        One state for each ATTITUDE (yaw, pitch, roll), each AIRSPEED, and each height message of the preferred type in
+        the log."""
+        return _states(self.t0_us, self.messages(_STATES))
+
+    @cached_property
+    def imu(self) -> list[Imu]:
+        """IMU samples in time order, in batches; times as in ``states``. Empty when the log has none.
+
+        The time stamp of a record is its arrival time. Integration needs the intervals of the autopilot's own clock, so
+        the samples keep their boot time plus a constant offset: the least difference between arrival and boot time in
+        the log, that of the packet with the least latency."""
+        return _inertial(self.t0_us, self.messages(_INERTIAL))
+
+    def notes(self) -> list[str]:
+        """Which vehicle was chosen and what was repaired, in words."""
+        found = []
+        if len(self.vehicles) > 1:
+            others = ", ".join(vehicle.text() for vehicle in self.vehicles)
+            found.append(f"vehicles heard: {others}; vehicle {self.system_id} is read, {self.choice.why}")
+        found += [jump_text(jump, (self._times_us[jump.index] - self.t0_us) * 1e-6) for jump in self.jumps]
+        if self.damaged_stamps:
+            found.append(f"{self.damaged_stamps} damaged time stamps of the log: repaired by the records beside them")
+        return found
+
+    def _decoded(self, packet: bytes) -> Any:
+        try:
+            return self._dialect.MAVLink(None).decode(bytearray(packet))
+        except self._dialect.MAVError:
+            return None
+
+    def _heard(self) -> list[HeardVehicle]:
+        """The autopilots, with what tells them apart where there are several."""
+        heard: dict[int, HeardVehicle] = {}
+        for system_id, component_id, _ in self._addresses:
+            if component_id == AUTOPILOT_COMPONENT:
+                heard.setdefault(system_id, HeardVehicle(system_id)).packets += 1
+        if not heard:
+            return []
+        several = len(heard) > 1
+        for packet, (system_id, component_id, message_id) in zip(self._packets, self._addresses, strict=True):
+            vehicle = heard.get(system_id)
+            if vehicle is None or component_id != AUTOPILOT_COMPONENT or message_id not in _STATES:
+                continue
+            is_heartbeat = message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+            vehicle.readings += not is_heartbeat
+            if not several and not (is_heartbeat and vehicle.vehicle_type is None):
+                continue
+            message = self._decoded(packet)
+            if message is not None:
+                _note(vehicle, message)
+        return list(heard.values())
+
+    def _check_choice(self, system_id: int) -> None:
+        if self.choice.vehicle is not None or (not self.vehicles and not system_id):
+            return
+        heard = ", ".join(vehicle.text() for vehicle in self.vehicles) or "none"
+        if system_id:
+            raise SourceError(f"{self.path}: has no vehicle {system_id}; heard: {heard}")
+        raise SourceError(
+            f"{self.path}: several vehicles could be meant: {heard}; choose one: --system, or [telemetry] system_id of "
+            "flight.toml"
+        )
+
+    def _boot_times_us(self) -> list[int | None]:
+        """Of each record of the vehicle, from the messages whose time runs; those of inertial sensors alone only where
+        no other says it, since theirs may be UNIX time."""
+        by_kind: defaultdict[int, dict[int, int]] = defaultdict(dict)
+        for i, (system_id, component_id, message_id) in enumerate(self._addresses):
+            place = _BOOT_TIMES.get(message_id)
+            if place is None or component_id != AUTOPILOT_COMPONENT or system_id != self.system_id:
+                continue
+            begin, end, unit_us = place
+            value_us = int.from_bytes(payload(self._packets[i]).ljust(end, b"\0")[begin:end], "little") * unit_us
+            if 0 < value_us < MAX_BOOT_US:
+                by_kind[message_id][i] = value_us
+        running = {kind: found for kind, found in by_kind.items() if len(set(found.values())) > len(found) // 2}
+        times_us: list[int | None] = [None] * len(self._addresses)
+        for milliseconds in (True, False):
+            for kind, found in running.items():
+                if (_BOOT_TIMES[kind][2] > 1) is milliseconds:
+                    for i, value_us in found.items():
+                        times_us[i] = value_us
+            if any(value is not None for value in times_us):
+                break
+        return times_us
+
+    def _numbers(self) -> list[int | None]:
+        mine = (self.system_id, AUTOPILOT_COMPONENT)
+        return [
+            sequence(packet) if sender[:2] == mine else None
+            for packet, sender in zip(self._packets, self._addresses, strict=True)
+        ]
+
+
+def jump_text(jump: Jump, at_s: float) -> str:
+    """A jump of the log's clock in words; ``at_s``: when, from the zero of the log."""
+    size_s = jump.size_us * 1e-6
+    size = f"{size_s:+.1f} s" if abs(size_s) < 86_400 else f"{size_s / 86_400:+.2f} days"
+    how = (
+        "repaired by the autopilot's time" if jump.measured else "taken for no gap, since no packet says the true time"
+    )
+    return f"the clock of the log jumps by {size} at {at_s:.1f} s: {how}"
+
+
+def is_tlog(head: bytes) -> bool:
+    """Whether these first bytes of a file hold a record."""
+    return bool(read_records(head, CRC_EXTRA).packets)
+
+
+def read_tlog(path: Path, t0_us: int | None = None, system_id: int = 0) -> list[VehicleState]:
+    """``TelemetryLog.states`` of a file. Raises SourceError."""
+    return TelemetryLog(path, t0_us, system_id).states
+
+
+def read_imu(path: Path, t0_us: int | None = None, system_id: int = 0) -> list[Imu]:
+    """``TelemetryLog.imu`` of a file. Raises SourceError."""
+    return TelemetryLog(path, t0_us, system_id).imu
+
+
+def _note(vehicle: HeardVehicle, message: Any) -> None:
+    kind = message.get_type()
+    if kind == "HEARTBEAT":
+        if vehicle.vehicle_type is None:
+            vehicle.vehicle_type = message.type
+            vehicle.firmware = firmware_of(message.autopilot, message.type)
+        vehicle.armed |= bool(message.base_mode & ARMED_FLAG)
+    elif kind == "ATTITUDE":
+        vehicle.angles_rad.append((message.roll, message.pitch, message.yaw))
+    elif kind == "GLOBAL_POSITION_INT":
+        vehicle.speed_mps = max(vehicle.speed_mps, math.hypot(message.vx, message.vy) / 100.0)
+
+
+def _states(t0_us: int, messages: Iterator[tuple[int, Any]]) -> list[VehicleState]:
     heights: dict[str, list[VehicleState]] = {kind: [] for kind in _HEIGHTS}
     attitudes: list[VehicleState] = []
     headings: list[VehicleState] = []
@@ -90,13 +281,7 @@ def read_tlog(path: Path, t0_us: int | None = None) -> list[VehicleState]:
     return sorted([*(attitudes or headings), *height, *airspeeds], key=lambda state: state.t_ns)
 
 
-def read_imu(path: Path, t0_us: int | None = None) -> list[Imu]:
-    """IMU samples in time order, in batches; times as in ``read_tlog``. Empty when the log has none.
-
-    The time stamp of a record is its arrival time. Integration needs the intervals of the autopilot's own clock, so the
-    samples keep their boot time plus a constant offset: the least difference between arrival and boot time in the log,
-    that of the packet with the least latency. Raises SourceError as ``read_tlog``."""
-    t0_us, messages = read_messages(path, _INERTIAL, t0_us)
+def _inertial(t0_us: int, messages: Iterator[tuple[int, Any]]) -> list[Imu]:
     selector = ImuStreamSelector()
     samples_of_boot: list[_TimedReadings] = []
     boots = [samples_of_boot]
@@ -125,84 +310,6 @@ def _batches(boot: list[_TimedReadings]) -> Iterator[Imu]:
             samples: list[ImuSample] = [(t_ns - at_ns, *values) for at_ns, values in batch]  # type: ignore[misc]
             yield Imu(t_ns=t_ns, source="mavlink", samples=samples)
             batch = []
-
-
-def record(t_us: int, packets: bytes) -> bytes:
-    """Encodes complete packets that arrived together at ``t_us`` (UNIX microseconds) as records."""
-    records, offset = [], 0
-    while offset < len(packets):
-        length = _packet_length(packets, offset)
-        records.append(t_us.to_bytes(_STAMP, "big") + packets[offset : offset + length])
-        offset += length
-    return b"".join(records)
-
-
-def is_tlog(head: bytes) -> bool:
-    """Whether a file that begins with these bytes begins with a record."""
-    return len(head) > _STAMP + 2 and _packet_length(head, _STAMP) > 0 and _time_us(head, 0) > MIN_TIME_US
-
-
-def read_messages(
-    path: Path, wanted: set[int], t0_us: int | None = None, dialect: Any = mavlink
-) -> tuple[int, Iterator[tuple[int, Any]]]:
-    """-> start time of the log [us], and (time [us], message) for all ``wanted`` message ids of the first autopilot
-    that sends one of them. ``dialect``: module of pymavlink that decodes them. Raises SourceError."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror})") from None
-    first = next(_records(data), None)
-    if first is None:
-        raise SourceError(f"{path}: holds no MAVLink record; is it a telemetry log (.tlog)?")
-    return first[0] if t0_us is None else t0_us, _decoded(data, wanted, dialect)
-
-
-def _decoded(data: bytes, wanted: set[int], dialect: Any) -> Iterator[tuple[int, Any]]:
-    parser, vehicle = dialect.MAVLink(None), None
-    for t_us, packet in _records(data):
-        sysid, compid, msgid = _address(packet)
-        if compid != AUTOPILOT_COMPONENT or msgid not in wanted or vehicle not in (None, sysid):
-            continue
-        try:
-            message = parser.decode(bytearray(packet))
-        except dialect.MAVError:
-            continue
-        vehicle = sysid
-        yield t_us, message
-
-
-def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(time [us], packet) of each record. Skips corrupt data byte by byte until a valid record begins."""
-    offset, last_us = 0, None
-    while offset + _STAMP + 8 <= len(data):
-        length = _packet_length(data, offset + _STAMP)
-        t_us = _time_us(data, offset)
-        plausible = t_us > MIN_TIME_US and (last_us is None or abs(t_us - last_us) < MAX_STEP_US)
-        if length == 0 or not plausible or offset + _STAMP + length > len(data):
-            offset += 1
-            continue
-        yield t_us, data[offset + _STAMP : offset + _STAMP + length]
-        last_us = t_us
-        offset += _STAMP + length
-
-
-def _time_us(data: bytes, offset: int) -> int:
-    return int.from_bytes(data[offset : offset + _STAMP], "big")
-
-
-def _packet_length(data: bytes, offset: int) -> int:
-    """Length of the packet at ``offset`` in bytes; 0: no packet begins there. From the MAVLink serialisation guide."""
-    if data[offset] == 0xFD:
-        signature = 13 if data[offset + 2] & 1 else 0
-        return 12 + data[offset + 1] + signature
-    return 8 + data[offset + 1] if data[offset] == 0xFE else 0
-
-
-def _address(packet: bytes) -> tuple[int, int, int]:
-    """(sysid, compid, message id)"""
-    if packet[0] == 0xFD:
-        return packet[5], packet[6], int.from_bytes(packet[7:10], "little")
-    return packet[3], packet[4], packet[5]
 
 
 def _finite(*values: float) -> bool:

@@ -23,6 +23,7 @@ from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.state import HEADING, HEIGHT, HORIZONTAL, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import CovarianceMode, Odometry, Verdict
 
+NO_NEW_VIEW = (Verdict.BAD_IMAGE, Verdict.OVERTAKEN, Verdict.STALLED)  # verdicts of vision on frames without a new view
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
 HEADING_GATE = 3.0  # sigmas between the turn of a new fragment and the reported heading [tuned]
 
@@ -68,7 +69,7 @@ class OdometryMeasurement:
         """``before``: the newest node; ``increment()``: of the motion model, from there to the frame."""
         odometry, attitude, t_s = frame.odometry, frame.attitude, frame.t_s
         alone = Fragment(t_s, odometry.fragment_id)  # of a frame without odometry that is fused
-        if odometry.verdict in (Verdict.BAD_IMAGE, Verdict.STALLED):  # no new view
+        if odometry.verdict in NO_NEW_VIEW:
             return GatedOdometry(odometry.verdict, None, alone)
         answer = self._first_motion(odometry, frame)
         if isinstance(answer, Verdict):

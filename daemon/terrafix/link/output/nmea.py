@@ -37,7 +37,8 @@ def _rmc(gps: GpsInput, has_fix: bool, time: str, lat_lon: str, utc: datetime | 
     speed = course = ""
     if has_fix:
         speed = f"{math.hypot(gps.vn_mps, gps.ve_mps) * KNOTS_PER_MPS:.3f}"
-        course = f"{math.degrees(math.atan2(gps.ve_mps, gps.vn_mps)) % 360.0:.2f}"
+        # rounded before the modulus: a course just west of north is 0.00 and not 360.00
+        course = f"{round(math.degrees(math.atan2(gps.ve_mps, gps.vn_mps)) * 100) % 36_000 / 100:.2f}"
     status, mode = ("A", "A") if has_fix else ("V", "N")
     return _sentence(f"RMC,{time},{status},{lat_lon},{speed},{course},{date},,,{mode}")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources.contract import Shot, Source
-from terrafix.vision.sources.images import IMAGE_SUFFIXES
+from terrafix.vision.sources.images import IMAGE_SUFFIXES, is_image_name
 
 __all__ = ["VIDEO_SUFFIXES", "Shot", "Source", "open_configured", "open_source", "parse_start"]
 
@@ -39,6 +39,8 @@ def open_source(
     if not on_disk:
         raise SourceError(f"{spec}: no such flight folder, photo folder, video or camera; check the path")
     path = Path(spec).expanduser()
+    if camera is not None and not camera.expanduser().is_file():
+        raise SourceError(f"{camera}: no such camera description; check [source] camera")
     if path.name == "flight.toml" and path.is_file():
         path = path.parent
     if path.is_dir():
@@ -87,7 +89,7 @@ def _open_folder(folder: Path, start: tuple[float, float] | None, camera: Path |
         names = set(os.listdir(folder))
     except OSError as error:
         raise SourceError(f"{folder}: cannot be read ({error.strerror})") from None
-    photos = any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names)
+    photos = any(map(is_image_name, names))
     if "frames.csv" in names or "frames" in names or ("flight.toml" in names and not photos):
         from terrafix.vision.sources.flight_folder import FlightFolder
 

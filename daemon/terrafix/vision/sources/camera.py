@@ -15,6 +15,7 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import Camera, Frame, Origin
 from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
+from terrafix.vision.sources.facts import Fact, camera_facts, mount_fact, start_fact
 from terrafix.vision.sources.mjpeg import MjpegCapture
 
 RECONNECT_S = 1.0  # a USB camera needs about this long to re-enumerate
@@ -62,7 +63,7 @@ class LiveCamera:
                 "camera description (config/cameras has an example)"
             )
         self.spec = f"/dev/video{spec}" if spec.isdecimal() else spec
-        self._description = read_description(camera)
+        self._described, self._description = camera, read_description(camera)
         self._origin = origin_of(self._description, camera_of(camera, self._description), start)
         self._period_ns = round(1e9 / rate_hz)
         self._open = open_capture or self._open_capture
@@ -88,6 +89,15 @@ class LiveCamera:
 
     def map_hint(self) -> Path | None:
         return None
+
+    def facts(self) -> list[Fact]:
+        camera, described = self._origin.camera, self._described.name
+        return [
+            *camera_facts(camera, f"[camera] of {described}"),
+            mount_fact(camera, f"[mount] of {described}"),
+            start_fact(self._origin, "--start, [source] start or the description"),
+            Fact("clock", "exposure by the driver's time stamp where it has one, else arrival"),
+        ]
 
     def close(self) -> None:
         """Ends ``shots``, from any thread; the thread that runs ``shots`` releases the device.

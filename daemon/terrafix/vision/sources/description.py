@@ -14,9 +14,10 @@ import msgspec
 from msgspec import Meta
 
 from terrafix.core.errors import SourceError
+from terrafix.core.mavlink.tlog import TelemetryLog
 from terrafix.core.toml_file import read_toml
 from terrafix.messages import Camera, Origin
-from terrafix.vision.sources.plausible import check_camera
+from terrafix.vision.sources.plausible import check_camera, check_centre
 
 START_SIGMA_M = 10.0  # a coordinate from a map or a phone before take-off
 YAW_SIGMA_DEG = 5.0  # compass of a small multirotor near its motors
@@ -83,6 +84,7 @@ class TelemetryTable(_Table, frozen=True, kw_only=True):
     agl_sigma_m: Positive = AGL_SIGMA_M
     attitude_sigma_deg: Positive = ATTITUDE_SIGMA_DEG
     tlog_t0_us: int | None = None  # UNIX microseconds of t_s = 0; absent: time of the first record of the log
+    system_id: Annotated[int, Meta(ge=0, le=255)] = 0  # vehicle of the log; 0: the only one, or the only one that moves
 
 
 class Description(_Table, frozen=True, kw_only=True):
@@ -122,11 +124,8 @@ def read_description(path: Path) -> Description:
         raise SourceError(
             f"{path}: [camera] distortion has {len(camera.distortion)} numbers; OpenCV takes 0, 4, 5, 8, 12 or 14"
         )
-    if camera and not (0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height):
-        raise SourceError(
-            f"{path}: [camera] cx, cy ({camera.cx:g}, {camera.cy:g}) lies outside the {camera.width}x{camera.height} "
-            "image; all of [camera] is in pixels of the stored frames"
-        )
+    if camera:
+        check_centre(path, camera)
     if description.start and description.start.ground_amsl_m is not None and description.start.alt_amsl_m is not None:
         raise SourceError(f"{path}: [start] has both ground_amsl_m and alt_amsl_m; they mean the same, keep one")
     return description
@@ -180,6 +179,11 @@ def origin_of(description: Description, camera: Camera, start: tuple[float, floa
         agl_sigma_m=description.telemetry.agl_sigma_m,
         attitude_sigma_deg=description.telemetry.attitude_sigma_deg,
     )
+
+
+def telemetry_log(path: Path, description: Description) -> TelemetryLog:
+    """The log of a flight, with the zero and the vehicle that its description states. Raises SourceError."""
+    return TelemetryLog(path, description.telemetry.tlog_t0_us, description.telemetry.system_id)
 
 
 def _check_numbers(path: Path, table: dict[str, Any], where: str = "") -> None:

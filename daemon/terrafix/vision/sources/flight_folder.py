@@ -7,10 +7,18 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from terrafix.core.errors import SourceError
-from terrafix.core.mavlink.tlog import read_imu, read_tlog
 from terrafix.messages import Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
-from terrafix.vision.sources.description import camera_of, origin_of, read_description
+from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
+from terrafix.vision.sources.facts import (
+    Fact,
+    camera_facts,
+    log_facts,
+    mount_fact,
+    rate_facts,
+    start_fact,
+    telemetry_facts,
+)
 from terrafix.vision.sources.images import WRONG_SIZE, downscaled_camera, read_image
 from terrafix.vision.sources.plausible import check_heights
 from terrafix.vision.sources.table import Row, read_table
@@ -23,6 +31,7 @@ class FlightFolder:
 
     def __init__(self, folder: Path, start: tuple[float, float] | None = None) -> None:
         self.folder = folder
+        self._start_given = start is not None
         toml = folder / "flight.toml"
         self._description = read_description(toml)
         self._stored = camera_of(toml, self._description)
@@ -32,8 +41,10 @@ class FlightFolder:
         check_heights(folder / "frames.csv", heights_m)
         self._check_files()
         self._check_size()
+        log = folder / "telemetry.tlog"
+        self._log = telemetry_log(log, self._description) if log.is_file() else None
         self._states = self._telemetry()
-        self._imu = self._inertial()
+        self._imu: list[Imu] = [] if self._log is None else self._log.imu
 
     def origin(self) -> Origin:
         return self._origin
@@ -46,6 +57,25 @@ class FlightFolder:
 
     def map_hint(self) -> Path | None:
         return (self.folder / self._description.map).resolve() if self._description.map else None
+
+    def facts(self) -> list[Fact]:
+        description, times_s = self._description, [row.t_ns / 1e9 for row in self._rows]
+        stated = [row.state for row in self._rows if row.state is not None]
+        found = [
+            *camera_facts(self._stored, "[camera] of flight.toml"),
+            mount_fact(self._stored, "[mount] of flight.toml"),
+            start_fact(self._origin, "--start" if self._start_given else "[start] of flight.toml"),
+            *rate_facts(times_s, "frames"),
+        ]
+        if stated or self._log is None:
+            found += telemetry_facts(stated, "frames.csv")
+        if self._log is not None:
+            found += telemetry_facts(self._log.states, self._log.path.name)
+            found += log_facts(self._log, description.telemetry.tlog_t0_us is not None)
+        outside = sum(not -1e9 <= state.t_ns <= self._rows[-1].t_ns for state in self._states)
+        if outside and outside == len(self._states):
+            found.append(Fact("left out", "all telemetry: none of it lies within the times of the frames"))
+        return found
 
     def close(self) -> None:
         """No resource stays open between shots."""
@@ -104,19 +134,10 @@ class FlightFolder:
     def _telemetry(self) -> list[VehicleState]:
         """States of frames.csv and telemetry.tlog in time order. A tlog may start before or after the first frame."""
         states = [row.state for row in self._rows if row.state is not None]
-        log = self._log()
-        if log is not None:
-            states += read_tlog(log, self._description.telemetry.tlog_t0_us)
+        if self._log is not None:
+            states += self._log.states
             states.sort(key=lambda state: state.t_ns)
         return states
-
-    def _inertial(self) -> list[Imu]:
-        log = self._log()
-        return [] if log is None else read_imu(log, self._description.telemetry.tlog_t0_us)
-
-    def _log(self) -> Path | None:
-        log = self.folder / "telemetry.tlog"
-        return log if log.is_file() else None
 
 
 def _is_inside(file: Path, frames: Path, real_frames: Path) -> bool:

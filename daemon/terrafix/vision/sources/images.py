@@ -22,6 +22,8 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
 WRONG_SIZE = "wrong size"  # prefix of the error when the image is complete but has not the size of the camera
+# What macOS and Windows leave beside photos: "._DJI_0001.JPG" has the icon and the labels of a file, and no picture.
+HIDDEN = "."
 GREY_FILL = 128  # libjpeg's value of blocks without data: coefficient 0
 GREY_BLOCK = 8  # side of a block in pixels; blocks are stored row by row, so checking the last one is sufficient
 # In entropy-coded data a marker is FF followed by anything but 00 (stuffing), FF (fill), D0..D7 (restart), T.81 B.1.1.
@@ -33,6 +35,16 @@ PNG_HEAD = b"\x89PNG\r\n\x1a\n"  # PNG specification 5.2; then chunks of length,
 # A reduced image keeps two and a half times that; a full one of 26 megapixels would take 78 MB and half a second.
 MIN_WIDTH_PX = 1500
 _REDUCED = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8}
+
+
+def is_image_name(name: str) -> bool:
+    """Whether a file with this name is an image by its suffix, and not hidden."""
+    return Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith(HIDDEN)
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images of a folder in the order of their names. Raises OSError."""
+    return sorted(path for path in folder.iterdir() if is_image_name(path.name) and path.is_file())
 
 
 def downscale_factor(width: int) -> int:

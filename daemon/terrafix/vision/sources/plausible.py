@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Protocol
 
 from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
@@ -15,11 +16,35 @@ MIN_DOWN_COMPONENT = 0.2  # down component of the optical axis: flatter rays hit
 MAX_AGL_M = 5000.0  # above ground; at more, a pixel of the narrowest accepted lens is coarser than any map
 
 
-def check_camera(path: Path, camera: Camera) -> None:
-    """Raises SourceError for an implausible field of view, focal ratio or mount. ``path``: the description file."""
+class PinholeImage(Protocol):
+    """What a camera and its table have in common, in pixels."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def cx(self) -> float: ...
+    @property
+    def cy(self) -> float: ...
+
+
+def check_centre(path: Path, camera: PinholeImage, what: str = "[camera]") -> None:
+    """Raises SourceError for a principal point outside of the image."""
+    if not (0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height):
+        raise SourceError(
+            f"{path}: {what} cx, cy ({camera.cx:g}, {camera.cy:g}) lies outside the {camera.width}x{camera.height} "
+            "image; all of [camera] is in pixels of the stored frames"
+        )
+
+
+def check_camera(path: Path, camera: Camera, what: str = "[camera]") -> None:
+    """Raises SourceError for an implausible field of view, focal ratio, principal point or mount. ``path``: the
+    description file, or folder of photos; ``what``: where the camera comes from."""
+    check_centre(path, camera, what)
     for name, focal, size in (("fx", camera.fx, camera.width), ("fy", camera.fy, camera.height)):
         fov_deg = math.degrees(2.0 * math.atan(0.5 * size / focal))
-        problem = f"{path}: [camera] {name} = {focal:g} and {size} px are a field of view of {fov_deg:.1f} degrees"
+        problem = f"{path}: {what} {name} = {focal:g} and {size} px are a field of view of {fov_deg:.1f} degrees"
         if fov_deg > MAX_FOV_DEG:
             millimetres = focal < MAX_FOCAL_MM and size > MAX_FOCAL_MM
             hint = (
@@ -44,13 +69,14 @@ def check_camera(path: Path, camera: Camera) -> None:
         )
 
 
-def check_heights(path: Path, agl_m: list[float]) -> None:
-    """Raises SourceError when the median height above ground is too large for metres. ``path``: the table."""
+def check_heights(path: Path, agl_m: list[float], what: str = "agl_m", where: str = "rows") -> None:
+    """Raises SourceError when the median height above ground is too large for metres. ``path``: the table, or the
+    folder of photos; ``what``: the value in words, ``where``: what has it."""
     if not agl_m:
         return
     median_m = sorted(agl_m)[len(agl_m) // 2]
     if median_m > MAX_AGL_M:
         raise SourceError(
-            f"{path}: agl_m is {median_m:g} in half of the rows, more than {MAX_AGL_M:.0f} m above the ground; "
+            f"{path}: {what} is {median_m:g} in half of the {where}, more than {MAX_AGL_M:.0f} m above the ground; "
             "is that in centimetres or millimetres? write metres"
         )

@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 
 from terrafix.core.errors import SourceError
-from terrafix.core.mavlink.tlog import read_imu, read_tlog
 from terrafix.messages import Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
-from terrafix.vision.sources.description import camera_of, origin_of, read_description
+from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
+from terrafix.vision.sources.facts import Fact, camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
 from terrafix.vision.sources.table import read_table
 
 FFMPEG_QUIET = "-8"  # AV_LOG_QUIET; a damaged image would otherwise print one line per block
@@ -31,11 +31,14 @@ class Video:
     ) -> None:
         self.path = path
         where = camera or self._find_description()
+        self._where, self._start_given = where, start is not None
         self._description = read_description(where)
         self._map_base = where.parent
         self._origin = origin_of(self._description, camera_of(where, self._description), start)
+        log = path.with_suffix(".tlog")
+        self._log = telemetry_log(log, self._description) if log.is_file() else None
         self._states = self._telemetry()
-        self._imu = self._inertial()
+        self._imu: list[Imu] = [] if self._log is None else self._log.imu
         self._period_s = 1.0 / rate_hz
         capture = self._open()
         self._fps = capture.get(cv2.CAP_PROP_FPS)
@@ -62,6 +65,20 @@ class Video:
 
     def map_hint(self) -> Path | None:
         return (self._map_base / self._description.map).resolve() if self._description.map else None
+
+    def facts(self) -> list[Fact]:
+        described = f"[camera] of {self._where.name}"
+        found = [
+            *camera_facts(self._origin.camera, described),
+            mount_fact(self._origin.camera, f"[mount] of {self._where.name}"),
+            start_fact(self._origin, "--start" if self._start_given else f"[start] of {self._where.name}"),
+            Fact("clock", "times of the container"),
+            Fact("rate", f"{1 / self._period_s:g} images a second of {self._fps:.3g} ([source] rate_hz)"),
+            *telemetry_facts(self._states, "the telemetry beside the video"),
+        ]
+        if self._log is not None:
+            found += log_facts(self._log, self._description.telemetry.tlog_t0_us is not None)
+        return found
 
     def close(self) -> None:
         """No resource stays open between shots."""
@@ -110,22 +127,14 @@ class Video:
         )
 
     def _telemetry(self) -> list[VehicleState]:
-        table, log = self.path.with_suffix(".csv"), self._log()
+        table = self.path.with_suffix(".csv")
         states: list[VehicleState] = []
         if table.is_file():
             rows = read_table(table, table.name, with_file=False)
             states += [row.state for row in rows if row.state is not None]
-        if log is not None:
-            states += read_tlog(log, self._description.telemetry.tlog_t0_us)
+        if self._log is not None:
+            states += self._log.states
         return sorted(states, key=lambda state: state.t_ns)
-
-    def _inertial(self) -> list[Imu]:
-        log = self._log()
-        return [] if log is None else read_imu(log, self._description.telemetry.tlog_t0_us)
-
-    def _log(self) -> Path | None:
-        log = self.path.with_suffix(".tlog")
-        return log if log.is_file() else None
 
     def _open(self) -> cv2.VideoCapture:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", FFMPEG_QUIET)

@@ -24,6 +24,7 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"GPS_INPUT stopped: no estimate for 35 s",
     r"estimator (died|stuck|gave up)",
     r"computer is (normal|hot|critical)(, -?\d+ C)?",
+    r"computer (too slow: \d+ of \d+ frames out|keeps up again)",
     r"GPS \d is \d+ m off the map",
     r"GPS \d and the map disagree",
     r"GPS \d is lost",

@@ -19,7 +19,7 @@ from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import POOL, PooledGradientDescriber
 from terrafix_tools.mapping.build import build, build_package, layer_of
 from terrafix_tools.mapping.check import suitability
-from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
+from terrafix_tools.mapping.choices import Descriptors
 
 SIDE_PX, LAT_DEG, LON_DEG = 800, 68.0, 17.4
 

@@ -9,8 +9,8 @@ from pyproj import Transformer
 
 import map_rasters
 from terrafix.core.errors import MapError, UsageError
+from terrafix_tools.mapping.choices import Datum
 from terrafix_tools.mapping.package import heights
-from terrafix_tools.mapping.package.height_datums import Datum
 from terrafix_tools.mapping.package.heights import to_amsl
 
 HEIGHT_M = np.linspace(300.0, 900.0, 200 * 300, dtype=np.float32).reshape(1, 200, 300)

@@ -1,5 +1,6 @@
 """Monte Carlo flights with false inputs: times and sizes of each."""
 
+import math
 from dataclasses import replace
 
 import msgspec
@@ -7,8 +8,9 @@ import numpy as np
 import pytest
 
 from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
+from terrafix_lab.faults.edits import Span
 from terrafix_lab.montecarlo import lies as of
-from terrafix_lab.montecarlo.fault import LIES, Fault
+from terrafix_lab.montecarlo.fault import LIES, DrawnFault
 from terrafix_lab.montecarlo.flight import Record
 from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight, fly
 from terrafix_lab.montecarlo.ground import Terrain
@@ -31,7 +33,7 @@ def always(match: MapMatch) -> of.FindMatch:
     return find
 
 
-def flown(fault: Fault, number: int = 0) -> tuple[FlightPlan, SimulatedFlight]:
+def flown(fault: DrawnFault, number: int = 0) -> tuple[FlightPlan, SimulatedFlight]:
     drawn = plan(5, number, fault=fault, duration_s=SHORT_S)
     return drawn, fly(drawn, Terrain(drawn.seed, drawn.hills_m, drawn.settled))
 
@@ -42,50 +44,51 @@ def test_each_false_input_has_its_probability_and_changes_nothing_else() -> None
         assert 0.025 < np.mean([lie in p.lies for p in plans]) < 0.08, lie
     honest = [n for n, p in enumerate(plans) if not p.lies]
     assert all(plans[n] == plan(1, n) for n in honest[:20])
-    lying = next(n for n, p in enumerate(plans) if p.lies == {Fault.FROZEN})
+    lying = next(n for n, p in enumerate(plans) if p.lies == {DrawnFault.FROZEN})
     assert replace(plans[lying], lies=frozenset()) == plan(1, lying)
     assert plans[lying].fault is plan(1, lying).fault
 
 
 def test_false_numbers_have_their_stated_sizes() -> None:
-    def numbers(fault: Fault, name: str) -> np.ndarray:
+    def numbers(fault: DrawnFault, name: str) -> np.ndarray:
         drawn = [plan(1, n, fault=fault) for n in range(40)]
         assert all(p.lies == {fault} for p in drawn)
         return np.array([getattr(p, name) for p in drawn])
 
-    assert set(np.round(numbers(Fault.SCALE, "height_scale"), 2)) == {0.7, 1.3, 3.28, 0.3}
-    assert set(np.round(np.degrees(numbers(Fault.HEADING, "compass_rad")))) == {-90, 90, 180}
-    described = 1.0 / (1.0 + numbers(Fault.FOCAL, "focal_error"))  # over the true one
+    assert set(np.round(numbers(DrawnFault.SCALE, "height_scale"), 2)) == {0.7, 1.3, 3.28, 0.3}
+    assert set(np.round(np.degrees(numbers(DrawnFault.HEADING, "compass_rad")))) == {-90, 90, 180}
+    described = 1.0 / (1.0 + numbers(DrawnFault.FOCAL, "focal_error"))  # over the true one
     assert 0.5 <= described.min() < 0.7 and 1.4 < described.max() <= 2.0
-    lag_s = numbers(Fault.STALE, "picture_lag_s")
+    lag_s = numbers(DrawnFault.STALE, "picture_lag_s")
     assert 0.2 <= lag_s.min() < 0.4 and 0.8 < lag_s.max() <= 1.0
-    assert np.hypot(*numbers(Fault.START, "start_error_m").T) == pytest.approx(300.0)
-    assert set(numbers(Fault.START, "start_sigma_m")) == {50.0}
+    assert np.hypot(*numbers(DrawnFault.START, "start_error_m").T) == pytest.approx(300.0)
+    assert set(numbers(DrawnFault.START, "start_sigma_m")) == {50.0}
 
 
 def test_late_pictures_show_the_earlier_position() -> None:
-    drawn, flight = flown(Fault.STALE)
+    drawn, flight = flown(DrawnFault.STALE)
     for seen, true in list(zip(flight.pictures, flight.frames, strict=True))[2:]:
         assert seen.t_s == true.t_s
         behind_m = float(np.hypot(*(true.p_m - seen.p_m)[:2]))
         assert behind_m == pytest.approx(drawn.picture_lag_s * np.hypot(*true.velocity_mps[:2]), abs=1.5)
-    _, honest = flown(Fault.NONE)
+    _, honest = flown(DrawnFault.NONE)
     assert all(np.array_equal(a.p_m, b.p_m) for a, b in zip(honest.pictures, honest.frames, strict=True))
 
 
 def test_a_frozen_camera_repeats_one_pose_with_new_times() -> None:
-    drawn, flight = flown(Fault.FROZEN)
+    drawn, flight = flown(DrawnFault.FROZEN)
     lies = Lies(drawn, flight)
     shown = [lies.picture(i) for i in range(len(flight.frames))]
     held = [i for i, shot in enumerate(shown) if not np.array_equal(shot.p_m, flight.frames[i].p_m)]
     assert held == list(range(held[0], held[-1] + 1)) and 14 <= len(held) <= 40
     assert all(np.array_equal(shown[i].p_m, flight.frames[held[0] - 1].p_m) for i in held)
     assert [shot.t_s for shot in shown] == [shot.t_s for shot in flight.frames]
-    assert lies.start_s() == flight.frames[held[0] - 1].t_s
+    span = lies.span()
+    assert span is not None and span.from_s == flight.frames[held[0] - 1].t_s
 
 
 def test_foreign_motion_is_far_away_and_consistent_and_has_no_map_match() -> None:
-    drawn, flight = flown(Fault.FOREIGN)
+    drawn, flight = flown(DrawnFault.FOREIGN)
     lies = Lies(drawn, flight)
     steps, foreign = [], []
     for i, true in enumerate(flight.frames):
@@ -105,11 +108,11 @@ def test_foreign_motion_is_far_away_and_consistent_and_has_no_map_match() -> Non
 
 
 def test_over_the_map_of_another_town_a_fifth_of_the_frames_have_wrong_matches() -> None:
-    drawn, flight = flown(Fault.TOWN)
+    drawn, flight = flown(DrawnFault.TOWN)
     lies, off = Lies(drawn, flight), []
-    start_s = lies.start_s()
-    assert start_s is not None
-    after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= start_s]
+    span = lies.span()
+    assert span is not None
+    after = [i for i, shot in enumerate(flight.frames) if shot.t_s >= span.from_s]
     for i in after * 20:  # enough matches to estimate a share
         match = lies.match(i, PREDICTION, always(FOUND))
         if match.pose is not None:
@@ -163,7 +166,8 @@ def judged(lie_from_s: float | None, false_at: list[int]) -> FlightResult:
         plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n),
         truth_m=np.zeros((n, 2)), error_m=error, cov=cov, velocity_error_mps=np.zeros((n, 3)),
         velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1), refined_error_m=np.zeros((n, 2)),
-        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n), memory_mb=np.zeros(n), lie_from_s=lie_from_s)  # fmt: skip
+        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n), memory_mb=np.zeros(n),
+        lie=None if lie_from_s is None else Span(lie_from_s, math.inf, ""))  # fmt: skip
     return FlightResult.of(record)
 
 

@@ -15,7 +15,7 @@ from terrafix.core.geodesy import quat_from_rot, rot_w_b
 from terrafix.core.pnp import solved
 from terrafix.estimator.measurements.odometry import OdometryMeasurement
 from terrafix.messages import MapMatch, Prediction, Verdict
-from terrafix_lab.montecarlo.fault import LIES, Fault
+from terrafix_lab.montecarlo.fault import LIES, DrawnFault
 from terrafix_lab.montecarlo.faults import JUMP_M, JUMPS, Faults
 from terrafix_lab.montecarlo.flight import find_match, run
 from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight, fly
@@ -32,7 +32,7 @@ SHORT_S = 60.0
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[FlightPlan, SimulatedFlight]:
-    drawn = replace(plan(5, 0, fault=Fault.NONE, duration_s=SHORT_S), has_dem=True)
+    drawn = replace(plan(5, 0, fault=DrawnFault.NONE, duration_s=SHORT_S), has_dem=True)
     return drawn, fly(drawn, Terrain(drawn.seed, drawn.hills_m, drawn.settled))
 
 
@@ -40,9 +40,9 @@ def test_a_plan_is_reproducible_and_a_round_has_every_fault() -> None:
     assert plan(3, 7) == plan(3, 7)
     assert plan(3, 7) != plan(4, 7)
     faults = [plan(1, n).fault for n in range(12)]
-    assert faults.count(Fault.NONE) == 4
-    assert set(faults) == set(Fault) - {Fault.HILLS, Fault.PHOTOS, *LIES}
-    assert all(abs(plan(1, n, fault=Fault.HEIGHT).height_scale - 1.0) == pytest.approx(0.1) for n in range(4))
+    assert faults.count(DrawnFault.NONE) == 4
+    assert set(faults) == set(DrawnFault) - {DrawnFault.HILLS, DrawnFault.PHOTOS, *LIES}
+    assert all(abs(plan(1, n, fault=DrawnFault.HEIGHT).height_scale - 1.0) == pytest.approx(0.1) for n in range(4))
 
 
 def test_registration_errors_of_100_maps_have_the_stated_distribution() -> None:
@@ -168,7 +168,7 @@ def test_faults_have_their_stated_times_and_sizes(flown: tuple[FlightPlan, Simul
     flight = flown[1]
     right = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.FEW_INLIERS, matcher="gradient")
 
-    def moved(fault: Fault) -> np.ndarray:
+    def moved(fault: DrawnFault) -> np.ndarray:
         faults, out = Faults(fault, 600.0, 1), []
         for i in range(600):
             shot = replace(flight.frames[0], t_s=float(i))
@@ -176,27 +176,27 @@ def test_faults_have_their_stated_times_and_sizes(flown: tuple[FlightPlan, Simul
             out.append(np.nan if pose is None else np.hypot(*(np.array(pose.p_c_in_w_m) - shot.p_m)[:2]))
         return np.array(out)
 
-    jumps = moved(Fault.JUMPS)
+    jumps = moved(DrawnFault.JUMPS)
     assert np.isfinite(jumps).sum() == JUMPS
     assert np.nanmax(np.abs(jumps - JUMP_M)) < 12.0
-    assert 0.06 < np.isfinite(moved(Fault.WRONG)).mean() < 0.14
-    assert np.isfinite(moved(Fault.ROWS)).sum() == 30
-    assert not np.isfinite(moved(Fault.NONE)).any()
-    blind = [Faults(Fault.BLACKOUT, 600.0, 1).is_blacked_out(float(t)) for t in range(600)]
+    assert 0.06 < np.isfinite(moved(DrawnFault.WRONG)).mean() < 0.14
+    assert np.isfinite(moved(DrawnFault.ROWS)).sum() == 30
+    assert not np.isfinite(moved(DrawnFault.NONE)).any()
+    blind = [Faults(DrawnFault.BLACKOUT, 600.0, 1).is_blacked_out(float(t)) for t in range(600)]
     assert sum(blind) == 120
 
 
 @pytest.mark.parametrize(
     ("fault", "t_s", "verdict"),
     [
-        (Fault.BLACKOUT, 160.0, Verdict.BAD_IMAGE),  # a blackout begins at a quarter of the flight
-        (Fault.DRIFT, 100.0, Verdict.FEW_INLIERS),  # the map ends at 90 s
-        (Fault.BLACKOUT, 100.0, Verdict.ACCEPTED),
-        (Fault.DRIFT, 80.0, Verdict.ACCEPTED),
+        (DrawnFault.BLACKOUT, 160.0, Verdict.BAD_IMAGE),  # a blackout begins at a quarter of the flight
+        (DrawnFault.DRIFT, 100.0, Verdict.FEW_INLIERS),  # the map ends at 90 s
+        (DrawnFault.BLACKOUT, 100.0, Verdict.ACCEPTED),
+        (DrawnFault.DRIFT, 80.0, Verdict.ACCEPTED),
     ],
 )
 def test_no_frame_is_matched_in_the_dark_or_over_ground_without_a_map(
-    flown: tuple[FlightPlan, SimulatedFlight], fault: Fault, t_s: float, verdict: Verdict
+    flown: tuple[FlightPlan, SimulatedFlight], fault: DrawnFault, t_s: float, verdict: Verdict
 ) -> None:
     drawn, flight = flown
     matches = _matches(drawn, flight, np.zeros(2))
@@ -211,7 +211,7 @@ def test_no_frame_is_matched_in_the_dark_or_over_ground_without_a_map(
 
 @pytest.mark.slow
 def test_a_flight_is_reproducible_and_close_to_the_truth() -> None:
-    drawn = replace(plan(5, 2, fault=Fault.NONE, duration_s=SHORT_S), start_sigma_m=5.0)
+    drawn = replace(plan(5, 2, fault=DrawnFault.NONE, duration_s=SHORT_S), start_sigma_m=5.0)
     one, two = run(drawn), run(drawn)
     for name in ("error_m", "cov", "velocity_error_mps", "refined_error_m"):
         assert np.array_equal(getattr(one, name), getattr(two, name), equal_nan=True)
@@ -222,7 +222,7 @@ def test_a_flight_is_reproducible_and_close_to_the_truth() -> None:
 @pytest.mark.slow
 def test_consistent_wrong_matches_cause_no_false_fix() -> None:
     """Regression: flight 22 had an error of 80 m for half a minute with a sigma of 3 m."""
-    seen = FlightResult.of(run(plan(1, 22, fault=Fault.ROWS, duration_s=100.0)))
+    seen = FlightResult.of(run(plan(1, 22, fault=DrawnFault.ROWS, duration_s=100.0)))
     assert seen.distance_m.max() > 50.0
     assert seen.false_fixes == 0
     assert float((seen.nees < 5.991).mean()) > 0.9
@@ -233,7 +233,7 @@ def test_consistent_wrong_matches_cause_no_false_fix() -> None:
 def test_an_unmapped_slope_is_not_taken_for_a_tilt_of_the_camera() -> None:
     """For half a minute all keyframes observe the same slope. Treated as independent, they moved flight 3 by 4.2 m per
     axis at a sigma of 2.4 m."""
-    seen = FlightResult.of(run(plan(1, 3, fault=Fault.HILLS, duration_s=180.0)))
+    seen = FlightResult.of(run(plan(1, 3, fault=DrawnFault.HILLS, duration_s=180.0)))
     assert float(seen.map_nees[60:].mean()) < 4.0
     assert float((seen.nees < 5.991).mean()) > 0.93
 
@@ -241,7 +241,7 @@ def test_an_unmapped_slope_is_not_taken_for_a_tilt_of_the_camera() -> None:
 @pytest.mark.slow
 def test_three_view_constraints_reduce_the_drift_over_hills_without_a_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two flights over relief of 20 m, 150 s without a map."""
-    hills = [plan(1, number, fault=Fault.DRIFT, duration_s=240.0) for number in (2, 8)]
+    hills = [plan(1, number, fault=DrawnFault.DRIFT, duration_s=240.0) for number in (2, 8)]
 
     def flown_m() -> tuple[float, float]:
         """Mean error without a map, and the sigma at its end."""
@@ -261,7 +261,7 @@ def test_three_view_constraints_reduce_the_drift_over_hills_without_a_map(monkey
 def test_sparse_photos_have_a_covariance_for_speed_and_turns() -> None:
     """Regression: flight 16 flies 22 m/s with map matches only. With a speed prior of odometry only, 10 m/s, a turn led
     it out of the search window, and 23 of its 120 positions were false."""
-    seen = FlightResult.of(run(plan(1, 16, fault=Fault.PHOTOS)))
+    seen = FlightResult.of(run(plan(1, 16, fault=DrawnFault.PHOTOS)))
     assert seen.false_fixes == 0
     assert float((seen.nees < 5.991).mean()) > 0.93
 

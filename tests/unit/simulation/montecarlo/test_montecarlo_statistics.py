@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafix_lab.montecarlo.endurance import RestartComparison, slopes
-from terrafix_lab.montecarlo.fault import Fault
+from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import run
 from terrafix_lab.montecarlo.plan import plan
 from terrafix_lab.montecarlo.statistics import band, draws_in, floors, whitened
@@ -118,8 +118,8 @@ def test_slopes_are_independent_of_the_load_of_the_machine(
 
 @pytest.mark.slow
 def test_a_restarted_estimator_processes_the_same_messages_and_agrees() -> None:
-    flight = RestartComparison(plan(1, 0, fault=Fault.NONE, duration_s=60.0), 30.0)
-    alone = run(plan(1, 0, fault=Fault.NONE, duration_s=60.0), refine=False)
+    flight = RestartComparison(plan(1, 0, fault=DrawnFault.NONE, duration_s=60.0), 30.0)
+    alone = run(plan(1, 0, fault=DrawnFault.NONE, duration_s=60.0), refine=False)
     record = flight.record(refine=False)
     np.testing.assert_array_equal(record.error_m, alone.error_m)  # the output of the old one is unchanged
     spent_ms = np.array(flight.frames_ms)

@@ -3,16 +3,20 @@
 A false fix is that of evaluate.py: an error of more than 50 m and more than 3 sigma. The lie is ``Marks.lie``."""
 
 import math
+from itertools import groupby
 
 import numpy as np
 
+from terrafix.core.gate import CHI2_95
 from terrafix_lab.accept.measuring.evidence import Evidence, FrameEvidence
-from terrafix_lab.accept.measuring.results import Measured, Span, Verdict
-from terrafix_tools.score import FALSE_FIX_ERROR_M, late_from_s
+from terrafix_lab.accept.measuring.results import Measured, Verdict
+from terrafix_lab.faults.edits import Span
+from terrafix_lab.track import CRITERIA, LATE_M, Track
+from terrafix_tools.report.data import radius95_m
+from terrafix_tools.score import FALSE_FIX_ERROR_M
 
 RECOVERED_M, RECOVERED_FRAMES = 20.0, 3  # recovered: below this error and not false, for this many consecutive frames
 LAST_SHARE = 0.1  # of the frames: an error there counts as permanent
-LATE_M = 20.0  # pictures with a delay of 1 s cause errors above this, and below 50 m
 MEDIAN_ERROR = math.sqrt(2.0 * math.log(2.0))  # of a circular normal error, in its sigmas (Rayleigh distribution)
 
 
@@ -26,31 +30,33 @@ def late_overconfident_over_20m(e: Evidence) -> Measured:
     return _late(e, LATE_M)
 
 
+def of_track(name: str, e: Evidence) -> Measured:
+    """A row of the criteria that all campaigns share."""
+    value = CRITERIA[name].measure(track_of(e))
+    return Measured(None, "never") if value == math.inf else Measured(value)
+
+
 def false_fixes_in_all(e: Evidence) -> Measured:
-    lie = lie_of(e)
-    wrong = [f for f in e.frames if is_false(f)]
-    during = sum(lie.has(f.t_s) for f in wrong)
-    before = sum(f.t_s < lie.from_s for f in wrong)
-    after = len(wrong) - during - before
-    return Measured(float(len(wrong)), f"{before} before the lie, {during} in it, {after} after it")
+    lie, track = lie_of(e), track_of(e)
+    wrong_s = track.t_s[track.is_false()].tolist()
+    during, before = sum(map(lie.has, wrong_s)), sum(t_s < lie.from_s for t_s in wrong_s)
+    after = len(wrong_s) - during - before
+    return Measured(float(len(wrong_s)), f"{before} before the lie, {during} in it, {after} after it")
 
 
 def time_to_notice_s(e: Evidence) -> Measured:
     """From the start of the lie to the last false fix; zero if there is none."""
-    since = [f for f in e.frames if f.t_s >= lie_of(e).from_s]
-    wrong = [number for number, f in enumerate(since, start=1) if is_false(f)]
-    if not wrong:
+    notice_s = track_of(e).notice_s()
+    if notice_s is None:
         return Measured(0.0, "no false fix")
-    return Measured(since[wrong[-1] - 1].t_s - lie_of(e).from_s, f"{wrong[-1]} frames")
+    frames = sum(0.0 <= f.t_s - lie_of(e).from_s <= notice_s for f in e.frames)
+    return Measured(notice_s, f"{frames} frames")
 
 
 def longest_false_run(e: Evidence) -> Measured:
     """Largest number of consecutive false frames."""
-    longest = run = 0
-    for frame in e.frames:
-        run = run + 1 if is_false(frame) else 0
-        longest = max(longest, run)
-    return Measured(float(longest))
+    runs = groupby(track_of(e).is_false().tolist())
+    return Measured(float(max((len(list(run)) for false, run in runs if false), default=0)))
 
 
 def recovery_frames(e: Evidence) -> Measured:
@@ -94,6 +100,20 @@ def claim_width(e: Evidence) -> Measured:
     )
 
 
+def track_of(e: Evidence) -> Track:
+    """Of the frames, with the span of ``lie_of`` as the fault."""
+    compared = [f.compared for f in e.frames]
+    nan = math.nan
+    numbers = [
+        (nan, nan) if c is None or c.error_m is None or c.mahalanobis2 is None else (c.error_m, c.mahalanobis2)
+        for c in compared
+    ]
+    radii_m = [radius95_m(f.row) for f in e.frames]
+    sigma_m = np.array([nan if r is None else r for r in radii_m]) / math.sqrt(CHI2_95)
+    error_m, nees = np.array(numbers).reshape(-1, 2).T
+    return Track(np.array([f.t_s for f in e.frames]), error_m, nees, sigma_m, lie_of(e))
+
+
 def is_false(frame: FrameEvidence, beyond_m: float = FALSE_FIX_ERROR_M) -> bool:
     """Whether the frame is a false fix; without truth it is not."""
     return frame.compared is not None and frame.compared.is_false(beyond_m)
@@ -104,12 +124,10 @@ def in_lie(e: Evidence, frame: FrameEvidence) -> bool:
 
 
 def _late(e: Evidence, beyond_m: float) -> Measured:
-    from_s = lie_of(e).from_s
-    late_s = late_from_s([f.t_s for f in e.frames], from_s)
-    wrong = [f for f in e.frames if is_false(f, beyond_m)]
-    late = [f for f in wrong if not from_s <= f.t_s <= late_s]
-    worst_m = max((f.error_m for f in late if f.error_m is not None), default=0.0)
-    return Measured(float(len(late)), f"of {len(wrong)}; {worst_m:.0f} m at worst" if late else f"of {len(wrong)}")
+    track = track_of(e)
+    late, of_all = track.is_late(beyond_m), f"of {track.is_false(beyond_m).sum()}"
+    worst_m = track.error_m[late].max(initial=0.0)
+    return Measured(float(late.sum()), f"{of_all}; {worst_m:.0f} m at worst" if late.any() else of_all)
 
 
 def _is_recovered(frame: FrameEvidence) -> bool:

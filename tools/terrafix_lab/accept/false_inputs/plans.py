@@ -7,18 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.node import Image
-from terrafix.messages import Origin
-from terrafix_lab.accept.false_inputs import inputs as lying
 from terrafix_lab.accept.false_inputs import maps as lying_maps
-from terrafix_lab.accept.faults import flight_edits
-from terrafix_lab.accept.faults.flight_edits import Edit
 from terrafix_lab.accept.flight import Flight
-from terrafix_lab.accept.measuring.results import Marks, Span
+from terrafix_lab.accept.measuring.results import Marks
 from terrafix_lab.accept.plan import Plan
+from terrafix_lab.faults.edits import OriginEdit, Span, pause, photos, start_moved, unchanged_origin
+from terrafix_lab.faults.fault import START
+from terrafix_lab.faults.pictures import mirrored, replaced
+from terrafix_lab.faults.table import SEED
 
 MIN_FRAMES = 24  # of a flight, for frames before and after the lie
-MIN_DURATION = 2.5  # of a flight over that of the lie, for time before and after it
-START = 0.4  # share of the frames before a lie that ends before the flight
 FOREIGN_ROW, FOREIGN_SHARE, INTERLEAVED = 10, 0.15, 30  # frames, share, frames
 FAST = 3  # speed over that of the flight: successive pictures still overlap by two thirds
 FAR_M = 150.0  # at least: more than a footprint, and three times the error of a false fix
@@ -42,24 +40,6 @@ def _lying(span: Span, **plan: object) -> Plan:
     return Plan(marks=Marks(spans=(span,), lie=span), **plan)  # type: ignore[arg-type]
 
 
-def throughout(text: str, **plan: object) -> Callable[[Flight], Plan | str]:
-    """The lie lasts from the first frame to the last."""
-    return lambda flight: _lying(_span(flight, 0, len(flight.frame_refs) - 1, text), **plan)
-
-
-def for_seconds(seconds: float, text: str, edit: Callable[[Span], Edit]) -> Callable[[Flight], Plan | str]:
-    """The lie begins after the share START of the frames and lasts for ``seconds``."""
-
-    def plan(flight: Flight) -> Plan | str:
-        if flight.duration_s < MIN_DURATION * seconds:
-            return f"the flight lasts only {flight.duration_s:.0f} s"
-        from_s = flight.frame_refs[flight.at(START)].t_s
-        span = Span(from_s, from_s + seconds, text)
-        return _lying(span, edit=edit(span))
-
-    return plan
-
-
 # --- pictures of another place ---
 
 
@@ -70,7 +50,7 @@ def _another_camera(flight: Flight, numbers: list[int], pace: int = 1) -> Plan |
         return why
     half = len(flight.frame_refs) // 2
     shown = {n: (numbers[0] + half + pace * (n - numbers[0])) % len(flight.frame_refs) for n in numbers}
-    return _pictures_of(flight, shown, lying.mirrored, "pictures of another place")
+    return _pictures_of(flight, shown, mirrored, "pictures of another place")
 
 
 def _pictures_of(flight: Flight, shown: dict[int, int], change: Callable[[Image], Image], text: str) -> Plan:
@@ -80,7 +60,7 @@ def _pictures_of(flight: Flight, shown: dict[int, int], change: Callable[[Image]
         return change(flight.picture(number))
 
     pictures = {flight.frame_refs[n].file: partial(load, other) for n, other in shown.items()}
-    return _lying(_span(flight, min(shown), max(shown), text), edit=lying.replaced(pictures))
+    return _lying(_span(flight, min(shown), max(shown), text), edit=replaced(pictures))
 
 
 def foreign_row(at: float = START, pace: int = 1) -> Callable[[Flight], Plan | str]:
@@ -94,7 +74,7 @@ def foreign_row(at: float = START, pace: int = 1) -> Callable[[Flight], Plan | s
 
 
 def foreign_at_random(flight: Flight) -> Plan | str:
-    drawn = np.random.default_rng([lying.SEED, 70]).uniform(size=len(flight.frame_refs)) < FOREIGN_SHARE
+    drawn = np.random.default_rng([SEED, 70]).uniform(size=len(flight.frame_refs)) < FOREIGN_SHARE
     numbers = [int(n) for n in np.flatnonzero(drawn) if 0.1 <= n / len(flight.frame_refs) <= 0.8]
     return _another_camera(flight, numbers) if numbers else "too few frames to have a foreign one"
 
@@ -123,7 +103,7 @@ def elsewhere_reversed(flight: Flight) -> Plan | str:
 def with_map(
     text: str,
     change: Callable[[Flight, Path, Path], str],
-    origin: Callable[[Origin], Origin] = flight_edits.unchanged_origin,
+    origin: OriginEdit = unchanged_origin,
 ) -> Callable[[Flight], Plan | str]:
     """``change`` (flight, map of the flight, map to write) makes the map of the scenario."""
 
@@ -161,9 +141,7 @@ def start_off(flight: Flight) -> Plan:
         np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0
     )  # towards the centre of the flight, where the map is
     east_m, north_m = (ahead * START_ERROR_M).tolist()
-    return _lying(
-        _span(flight, 0, 0, "the start is 300 m off"), origin=flight_edits.start_moved(east_m, north_m, START_SIGMA_M)
-    )
+    return _lying(_span(flight, 0, 0, "the start is 300 m off"), origin=start_moved(east_m, north_m, START_SIGMA_M))
 
 
 def sparse_photos(flight: Flight) -> Plan | str:
@@ -173,11 +151,7 @@ def sparse_photos(flight: Flight) -> Plan | str:
         if np.isfinite(place).all() and (last is None or np.hypot(*(place - last)) >= PHOTO_M):
             chosen.append(flight.frame_refs[number].file)
             last = place
-    return (
-        Plan(lying.photos(frozenset(chosen)))
-        if len(chosen) >= 6
-        else f"only {len(chosen)} photos {PHOTO_M:.0f} m apart"
-    )
+    return Plan(photos(frozenset(chosen))) if len(chosen) >= 6 else f"only {len(chosen)} photos {PHOTO_M:.0f} m apart"
 
 
 def gap_of_minutes(flight: Flight) -> Plan | str:
@@ -188,4 +162,4 @@ def gap_of_minutes(flight: Flight) -> Plan | str:
     span = Span(flight.frame_refs[first - 1].t_s, flight.frame_refs[end].t_s + GAP_MORE_S, "no frames, no telemetry")
     # The span ends before the first frame after the gap.
     gap = Span(span.from_s, span.to_s - 1e-3, span.text)
-    return Plan(lying.pause(first, end, GAP_MORE_S), marks=Marks(spans=(gap,)))
+    return Plan(pause(first, end, GAP_MORE_S), marks=Marks(spans=(gap,)))

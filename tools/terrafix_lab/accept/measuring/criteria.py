@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from terrafix_lab.accept.false_inputs import integrity, loop_integrity
 from terrafix_lab.accept.measuring import measures as of
 from terrafix_lab.accept.measuring.consistency import COVERAGE
 from terrafix_lab.accept.measuring.evidence import Evidence
 from terrafix_lab.accept.measuring.results import Bounds, JudgedRow, Measured, Verdict
+from terrafix_lab.track import CRITERIA as CRITERIA_OF_TRACKS
 
 
 @dataclass(frozen=True)
@@ -94,16 +96,33 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "fix again": ("AC-15", "3D fix and right again after the lie", "s", _most(5.0), None, loop_integrity.fix_again_s),
     "mode": ("ON-2", "frames with the covariance mode that heat asks for", "%", ALL, None, of.right_mode),
 }  # fmt: skip
+SHARED = tuple(name for name in CRITERIA_OF_TRACKS if name not in _ROWS)  # with all campaigns; shown, not judged
+_ROWS |= {
+    name: (
+        "AC-15",
+        CRITERIA_OF_TRACKS[name].what,
+        CRITERIA_OF_TRACKS[name].unit,
+        None,
+        None,
+        partial(integrity.of_track, name),
+    )
+    for name in SHARED
+}
 CRITERIA = {name: Criterion(*row, not_judged=LATENCY_NOTE if name == "latency" else "") for name, row in _ROWS.items()}
 
 # Rows of a false input that lasts to the end of the flight, and of one that ends before.
-PERMANENT = ("late false fixes", "false fixes in all", "time to notice", "longest false run", "near at all", "claims")
+PERMANENT = (
+    "late false fixes", "false fixes in all", "time to notice", "longest false run", "near at all", "claims",
+    *SHARED,
+)  # fmt: skip
 TEMPORARY = (*PERMANENT, "recovery", "right at the end", "claim width")
 LYING_IN_THE_LOOP = (
     "aside on a fix", "aside at withdrawal", "late lies sent", "lies sent", "fix again", "recovery",
     "late false fixes", "false fixes in all", "right at the end", "claims", "vehicle error", "failsafes",
 )  # fmt: skip
+WITH_SPAN = ("claims", "coverage", "false fixes", "both estimates", "within 50 m outside", "says so", "found again")
 EVERYWHERE = ("within 50 m", "within 20 m", "not localised", "both estimates", "claims", "coverage", "false fixes")
+SCARCE = (*EVERYWHERE, "claim width")
 
 
 def judge(scenario: str, names: tuple[str, ...], evidence: Evidence) -> list[JudgedRow]:

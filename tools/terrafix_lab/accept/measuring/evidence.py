@@ -23,7 +23,7 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix.recorder.reader import read_flight
-from terrafix_lab.accept.faults.flight_edits import original
+from terrafix_lab.accept.long_route import original
 from terrafix_lab.accept.measuring.results import Marks
 from terrafix_tools.estimates import ESTIMATES, Row, read_rows
 from terrafix_tools.evaluate import Compared, Truth, compare, metrics, read_summary

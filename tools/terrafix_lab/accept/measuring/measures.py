@@ -15,7 +15,8 @@ from terrafix_lab.accept.measuring.consistency import FLIGHT_CONFIDENCE, judge_c
 from terrafix_lab.accept.measuring.epipolar import reprojection_error
 from terrafix_lab.accept.measuring.evidence import Evidence, FrameEvidence
 from terrafix_lab.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals, shows_distortion
-from terrafix_lab.accept.measuring.results import Measured, Span, Verdict
+from terrafix_lab.accept.measuring.results import Measured, Verdict
+from terrafix_lab.faults.edits import Span
 
 NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
 MIN_PATH_M = 100.0  # a relative drift over a shorter path has no meaning

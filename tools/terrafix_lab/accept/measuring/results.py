@@ -5,6 +5,8 @@ from enum import StrEnum
 
 import msgspec
 
+from terrafix_lab.faults.edits import Span
+
 
 class Verdict(StrEnum):
     PASS = "pass"
@@ -36,17 +38,6 @@ class Bounds:
         if self.low is not None:
             return f">= {with_unit(self.low, unit)}"
         return f"<= {with_unit(self.high, unit)}"
-
-
-class Span(msgspec.Struct, frozen=True):
-    """A time span of the flight with a fault, in seconds of its time stamps."""
-
-    from_s: float
-    to_s: float
-    text: str
-
-    def has(self, t_s: float) -> bool:
-        return self.from_s <= t_s <= self.to_s
 
 
 class Marks(msgspec.Struct, frozen=True, kw_only=True):

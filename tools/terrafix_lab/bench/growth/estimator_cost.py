@@ -24,7 +24,7 @@ from terrafix.estimator.graph.marginalized import MarginalizedHistory
 from terrafix.estimator.graph.pose_graph import PoseGraph
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import Imu
-from terrafix_lab.bench.growth.stream import ORIGIN, frame_messages
+from terrafix_lab.bench.growth.stream import frame_messages, origin
 from terrafix_tools.replay import peak_memory_mb
 from terrafix_tools.timing import spread
 
@@ -98,7 +98,7 @@ class _WholeFlight(MarginalizedHistory):
 def measure(frames: int) -> dict[str, Any]:
     """-> times per frame (of the last ones), of the refinement after landing and of covariance queries; memory."""
     graph = _TimedGraph()
-    estimator = Estimator(ORIGIN, graph=graph)
+    estimator = Estimator(origin(), graph=graph)
     times_ms: list[float] = []
     update_ms: list[float] = []
     query_ms: list[float] = []
@@ -147,7 +147,7 @@ def _flown(estimator: Estimator, frames: int) -> Iterator[float]:
 def _from_scratch(frames: int) -> dict[str, dict[str, float]]:
     """-> times of the same covariance query with ``gtsam.Marginals``, after the same flight."""
     flight = _WholeFlight()
-    estimator = Estimator(ORIGIN, graph=PoseGraph(flight))
+    estimator = Estimator(origin(), graph=PoseGraph(flight))
     for _ in _flown(estimator, frames):
         pass
     newest = estimator.graph.newest

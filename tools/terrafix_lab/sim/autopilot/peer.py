@@ -15,6 +15,8 @@ from dataclasses import replace
 
 from terrafix.core.errors import LinkError
 from terrafix.core.geodesy import LocalFrame
+from terrafix_lab.faults.edits import Edit
+from terrafix_lab.faults.source import EditedSensors
 from terrafix_lab.sim.autopilot.course import Course, CourseFollower
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.autopilot.parameters import GPS_INPUT_ALONE, NO_DCM, Kind
@@ -106,6 +108,11 @@ class AutopilotPeer:
             with contextlib.suppress(OSError):
                 self._socket.sendto(data, self._companion)
 
+    def edit_telemetry(self, edit: Edit | None) -> None:
+        """From now on attitude, heading and height pass through ``edit``, on the monotonic clock; None: they are as
+        measured."""
+        self._sensors.alter(edit, self._started_s)
+
     def reboot(self) -> None:
         """The autopilot starts again in the air, without a position, and its clock begins at zero."""
         self._reboots = True
@@ -125,7 +132,9 @@ class AutopilotPeer:
             home_amsl_m=first.amsl_m - first.agl_m if self._home_amsl_m is None else self._home_amsl_m,
             boot_ns=Clock.of(self._seed).boot_ns,
         )
-        self._sensors = VehicleSensors(frame, seed=self._seed, airspeed=not math.isnan(first.airspeed_mps))
+        self._sensors = EditedSensors(
+            VehicleSensors(frame, seed=self._seed, airspeed=not math.isnan(first.airspeed_mps))
+        )
         self._monitor = PeerMonitor(self._autopilot, frame)
 
     def _new_autopilot(

@@ -16,12 +16,11 @@ from terrafix_tools.mapping.area.checks import check_area
 from terrafix_tools.mapping.area.files import DEFAULT_BUFFER_KM, is_line, read_area
 from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.build import build_package, layer_of
+from terrafix_tools.mapping.choices import Datum, Descriptors
 from terrafix_tools.mapping.fetching.progress import shown
 from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
 from terrafix_tools.mapping.orthomosaic.write import read_statement
 from terrafix_tools.mapping.package.dem import DemSource
-from terrafix_tools.mapping.package.descriptor_kinds import Descriptors
-from terrafix_tools.mapping.package.height_datums import Datum
 from terrafix_tools.mapping.package.heights import to_amsl
 from terrafix_tools.mapping.sources.copernicus import glo30
 from terrafix_tools.mapping.sources.prepare import Preparation, Request

@@ -14,8 +14,8 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from terrafix.core.errors import MapError, OutputError, UsageError
+from terrafix_tools.mapping.choices import Datum
 from terrafix_tools.mapping.mosaic.warp import NODE_PX, spread
-from terrafix_tools.mapping.package.height_datums import Datum
 from terrafix_tools.mapping.source import crs_of, open_raster
 
 BLOCK_PX = 1024

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrafix.messages import GpsInput, Message, ProcessEvent
-from terrafix_lab.sim.interval.pace import measure
+from terrafix_lab.bench.intervals import measure
 
 
 def gps(t_ms: float, age_ms: float, fix_type: int = 3) -> GpsInput:

@@ -8,7 +8,7 @@ import numpy as np
 from terrafix.core.node import Node
 from terrafix.core.pnp import solved
 from terrafix.messages import Frame, Health, MapMatch, Message, Prediction, ThermalBand
-from terrafix_lab.accept.measuring.results import Span
+from terrafix_lab.faults.edits import Span
 from terrafix_lab.sim.true_messages import placed
 
 OUTLIER_M = 350.0  # AC-3

@@ -2,12 +2,10 @@
 
 from collections.abc import Iterable
 from itertools import pairwise
-from pathlib import Path
 
 import msgspec
 
 from terrafix.messages import GpsInput, Message, ProcessEvent
-from terrafix.recorder.reader import read_flight
 from terrafix_tools.score import quantile
 
 MEDIAN_MS, P99_MS, GAP_MS = 100.0, 120.0, 245.0  # AC-14; the autopilot reports a GPS as unhealthy after two longer gaps
@@ -41,9 +39,22 @@ class IntervalStats(msgspec.Struct, frozen=True, kw_only=True):
         return abs(median - MEDIAN_MS) <= MEDIAN_WITHIN_MS and p99 <= P99_MS and gap <= GAP_MS
 
 
-def read_stats(record: Path) -> IntervalStats:
-    """Measures a record. Raises SourceError when there is none."""
-    return measure(message for _, _, message in read_flight(record))
+def lines_of(stats: IntervalStats) -> dict[str, str]:
+    """For people: name -> value."""
+    return {
+        "GPS_INPUT": f"{stats.gps_inputs} in {stats.duration_s:.0f} s, 3D fix in {stats.fix3_share:.1%}",
+        "interval": f"median {_ms(stats.interval_median_ms)}, p99 {_ms(stats.interval_p99_ms)}",
+        "longest gap": _ms(stats.longest_gap_ms),
+        "over 120 ms": f"{stats.over_p99_floor}, over 245 ms {stats.over_gap_floor}",
+        "AC-14": "met" if stats.meets_ac14 else "not met",
+        "image to first GPS_INPUT": f"median {_ms(stats.first_age_median_ms)}, p95 {_ms(stats.first_age_p95_ms)}",
+        "age of the image": f"p95 {_ms(stats.age_p95_ms)}",
+        "processes": ", ".join(stats.trouble) or "none died or hung",
+    }
+
+
+def _ms(value: float | None) -> str:
+    return "no data" if value is None else f"{value:.1f} ms"
 
 
 def measure(messages: Iterable[Message]) -> IntervalStats:

@@ -1,6 +1,13 @@
-"""Names of the vertical datums; separate from their conversion, so that --help is fast."""
+"""Values of options of `terrafix map build`."""
 
 from enum import StrEnum
+
+
+class Descriptors(StrEnum):
+    """Kind of descriptors that a package holds for the search of the whole map."""
+
+    WEIGHTS_FREE = "weights-free"  # pooled gradients
+    NONE = "none"
 
 
 class Datum(StrEnum):

@@ -1,0 +1,36 @@
+"""Texts to the pilot about a computer that is too slow for the camera."""
+
+from link_rig import S, texts
+from terrafix.link.node import LinkNode
+from terrafix.messages import OVERTAKEN, Frame, Message
+
+RATE = 2  # frames per second
+
+
+def texts_of(left_out: list[bool], error: str = OVERTAKEN) -> list[str]:
+    """Of a link that receives frames at RATE, each with ``error`` where it is left out."""
+    node, published = LinkNode(10.0), list[Message]()
+    for i, out in enumerate(left_out):
+        frame = Frame(t_ns=i * S // RATE, frame_id=i, file="", width=640, height=480, error=error if out else "")
+        published += node.on(frame)
+    return texts(published)
+
+
+def test_a_computer_that_leaves_out_most_frames_is_reported_once_and_so_is_its_recovery() -> None:
+    slow, fast = [i % 4 != 0 for i in range(60)], [False] * 60
+    assert texts_of(fast + slow + fast) == [
+        "Terrafix: computer too slow: 11 of 20 frames out",
+        "Terrafix: computer keeps up again",
+    ]
+
+
+def test_a_few_overtaken_frames_are_no_slow_computer() -> None:
+    assert texts_of([i % 2 == 0 for i in range(9)]) == [] and texts_of([i % 3 == 0 for i in range(100)]) == []
+
+
+def test_unreadable_images_are_no_slow_computer() -> None:
+    assert texts_of([True] * 100, error="truncated") == []
+
+
+def test_a_load_at_the_limit_is_reported_seldom() -> None:
+    assert len(texts_of(([True] * 20 + [False] * 20) * 10)) <= 10  # 200 s; 20 changes

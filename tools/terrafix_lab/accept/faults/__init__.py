@@ -1,1 +1,0 @@
-"""Faults that a scenario adds to a flight."""

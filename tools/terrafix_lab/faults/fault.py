@@ -1,0 +1,118 @@
+"""What a fault is: its name, what it does to the source or to the processes of a flight, and words for reports."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from terrafix.core.errors import UsageError
+from terrafix_lab.faults.edits import EVER, Edit, OriginEdit, Span, unchanged
+
+if TYPE_CHECKING:
+    from terrafix_lab.chaos.rig import Rig
+
+START = 0.4  # share of the flight before a fault that ends before the flight
+
+
+class Phase(StrEnum):
+    """When a fault begins in the fault matrix."""
+
+    START = "before the first fix"  # of the processes, in cruise
+    CRUISE = "cruise"
+    TURN = "turn"
+    DARK = "dark"  # in cruise; the images are black from 4 s before the fault to its end
+    LANDING = "landing"  # as the descent begins
+
+
+class Need(StrEnum):
+    """What a fault needs beside frames, telemetry and a map. ROOT: only root can mount it."""
+
+    PROCESSES = "the real processes"
+    LIVE = "a live camera"
+    PIXELS = "images"
+    SEARCH = "a search over the map"
+    UNKNOWN = "a source that reports not everything"
+    DISK = "a disk of its own for the record"
+    SHARED_MEMORY = "shared memory of its own"
+    SERIAL = "a serial line to the autopilot"
+    SWITCHES = "the switches of switches.py"
+    MODEL = "the weights of XFeat"
+    CONSOLE = "a console that shows the flight"
+    MEMORY_GROUP = "a control group of memory"
+
+
+ROOT = frozenset({Need.DISK, Need.SHARED_MEMORY, Need.MEMORY_GROUP})
+Action = Callable[["Rig"], None]
+
+
+def nothing(_rig: "Rig") -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Process:
+    """What is done to the processes, by the rig of the fault matrix. ``during`` is called often with the seconds since
+    the beginning."""
+
+    begin: Action = nothing
+    end: Action = nothing
+    during: Callable[["Rig", float], None] = lambda _rig, _s: None
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One row of the table. ``lasts_s`` None: from the first frame to the last. ``source``: the edit of the shots in a
+    span. ``origin``: an edit of start and camera, for the whole flight. ``is_true``: no input is false, some are
+    missing. ``no_fix_in``: phases of the fault matrix in which no fix is expected after it."""
+
+    name: str
+    words: str = ""
+    lasts_s: float | None = None
+    source: Callable[[Span], Edit] | None = None
+    origin: OriginEdit | None = None
+    process: Process | None = None
+    needs: frozenset[Need] = frozenset()
+    is_true: bool = False
+    no_fix_in: frozenset[Phase] = frozenset({Phase.LANDING})  # it ends below the least height for matching
+
+    def edit(self, span: Span) -> Edit:
+        """Of the source; the fault of a whole flight hits also what comes before the first frame."""
+        if self.source is None:
+            return unchanged
+        return self.source(EVER if self.lasts_s is None else span)
+
+    @property
+    def flight_s(self) -> float:
+        """Shortest flight in which it is flown: with time before and after it."""
+        return 0.0 if self.lasts_s is None else self.lasts_s / START
+
+    def span(self, first_s: float, last_s: float, from_s: float | None = None) -> Span:
+        """Of a flight from ``first_s`` to ``last_s``. ``from_s``: beginning of a fault that ends before the flight;
+        None: after the share START."""
+        if self.lasts_s is None:
+            return Span(first_s, last_s, self.name)
+        begin_s = first_s + START * (last_s - first_s) if from_s is None else from_s
+        return Span(begin_s, begin_s + self.lasts_s, self.name)
+
+
+CAMPAIGNS = {  # command -> what its driver has
+    "terrafix accept --scenario": frozenset({Need.PIXELS, Need.SEARCH, Need.UNKNOWN}),
+    "terrafix montecarlo --fault": frozenset({Need.UNKNOWN}),
+    "terrafix chaos --fault": frozenset(Need) - {Need.UNKNOWN},
+}
+
+
+def lacking(command: str, fault: Fault) -> list[Need]:
+    """What a fault needs that ``command``, a key of CAMPAIGNS, has not."""
+    needed = fault.needs | ({Need.PROCESSES} if fault.process is not None else set())
+    return sorted(needed - CAMPAIGNS[command])
+
+
+def check_flown_by(command: str, fault: Fault) -> None:
+    """Raises UsageError: ``command`` lacks something that the fault needs."""
+    if missing := lacking(command, fault):
+        able = [other for other in CAMPAIGNS if not lacking(other, fault)]
+        raise UsageError(
+            f"{command} '{fault.name}': the fault needs {' and '.join(missing)}, which is not there; "
+            f"fly it by {' or '.join(able)}"
+        )

@@ -1,0 +1,257 @@
+"""The table of faults. Acceptance, Monte Carlo and the fault matrix name its rows, as far as their driver has what a
+row needs: `terrafix accept --scenario`, `terrafix montecarlo --fault`, `terrafix chaos --fault`."""
+
+from collections.abc import Callable
+from functools import partial, reduce
+from itertools import accumulate, pairwise
+
+from terrafix.core.errors import UsageError
+from terrafix_lab.faults import edits, pictures
+from terrafix_lab.faults.edits import Edit, Span, StateEdit, during
+from terrafix_lab.faults.fault import Fault, Need
+from terrafix_lab.faults.processes import AROUND_THEM, KILLED_AND_LIMITED, SHORT_S
+
+FROZEN_S, FORGED_S, LATE_S, FALLING_BEHIND_S = 15.0, 10.0, 1.0, 40.0
+BUFFERS = 4
+STILL_SHARE, LATE_TELEMETRY_S = 0.5, 2.0
+DROPPED, DOUBLED, SEED = 0.15, 0.15, 1
+PIXELS, LIVE = frozenset({Need.PIXELS}), frozenset({Need.LIVE})
+UNKNOWN = frozenset({Need.UNKNOWN})
+
+
+def whole(edit: Edit) -> Callable[[Span], Edit]:
+    return lambda _span: edit
+
+
+def reported(change: StateEdit) -> Callable[[Span], Edit]:
+    """In the telemetry of the span."""
+    return lambda span: edits.forged(span, change)
+
+
+def shown(change: pictures.Change) -> Callable[[Span], Edit]:
+    """In the pictures of the span."""
+    return lambda span: during(span, pictures.every_picture(change))
+
+
+def in_turn(name: str, words: str, *faults: Fault) -> Fault:
+    """Faults of the source that follow each other, each as long as it lasts."""
+
+    def source(span: Span) -> Edit:
+        spans = list(accumulate((f.lasts_s or 0.0 for f in faults), initial=span.from_s))
+        edited = [f.edit(Span(a, b, f.name)) for f, (a, b) in zip(faults, pairwise(spans), strict=True)]
+        return lambda shots: reduce(lambda given, edit: edit(given), edited, shots)
+
+    needs, lasts_s = frozenset().union(*(f.needs for f in faults)), sum(f.lasts_s or 0.0 for f in faults)
+    return Fault(name, words, lasts_s, source, needs=needs, is_true=all(f.is_true for f in faults))
+
+
+NONE = Fault("none", lasts_s=0.0, is_true=True)
+CAMERA = (
+    Fault("camera: unplugged", "No frame comes.", SHORT_S, edits.unplugged, is_true=True),
+    Fault("camera: frozen", "One picture again and again.", SHORT_S, pictures.frozen, is_true=True),
+    Fault("camera: black", "Black pictures.", SHORT_S, pictures.black, is_true=True),
+    Fault(
+        "camera: overexposed",
+        "All but the darkest ground is white.",
+        SHORT_S,
+        shown(pictures.overexposed),
+        needs=PIXELS,
+        is_true=True,
+    ),
+    Fault("camera: defocused", "Blurred pictures.", SHORT_S, shown(pictures.defocused), needs=PIXELS, is_true=True),
+    Fault(
+        "camera: wrong resolution",
+        "Half the width and height.",
+        SHORT_S,
+        shown(pictures.halved),
+        needs=PIXELS,
+        is_true=True,
+    ),
+    Fault("camera: no JPEG", "Bytes that are no image.", SHORT_S, pictures.torn, is_true=True),
+    Fault(
+        "camera: each image ten times",
+        "Ten times the frames.",
+        SHORT_S,
+        partial(edits.repeated, times=10),
+        needs=LIVE,
+        is_true=True,
+    ),
+    Fault(
+        "camera: stamps 5 s ahead",
+        "Time stamps in the future.",
+        SHORT_S,
+        partial(edits.stamped, by_s=5.0),
+        needs=LIVE,
+        is_true=True,
+    ),
+    Fault(
+        "camera: stamps 3 s late",
+        "Time stamps in the past.",
+        SHORT_S,
+        partial(edits.stamped, by_s=-3.0),
+        needs=LIVE,
+        is_true=True,
+    ),
+)
+HEIGHTS = (
+    ("height 30 % low", "The reported height is 30 % too small, and stated as good.", 0.7),
+    ("height 30 % high", "The reported height is 30 % too large, and stated as good.", 1.3),
+    ("height in feet", "The reported height is in feet where metres are expected.", edits.FEET_IN_A_METRE),
+    ("height taken for feet", "The reported height was divided by 3.28 once too often.", 1.0 / edits.FEET_IN_A_METRE),
+)
+# Inputs that are wrong and look right: the position must be right or withdrawn.
+FALSE_INPUTS = (
+    *(
+        Fault(
+            f"heading {off} degrees off",
+            f"The reported heading is off by {off} degrees throughout.",
+            source=reported(edits.turned(off)),
+        )
+        for off in (90, 180)
+    ),
+    *(
+        Fault(
+            f"camera mounted {word}",
+            f"The camera is turned by {off:g} degrees, and the description does not say so.",
+            origin=edits.mount_yaw_plus(off),
+        )
+        for word, off in (("sideways", 90.0), ("backwards", 180.0))
+    ),
+    Fault("mirrored pictures", "Left and right are exchanged in every picture.", source=shown(pictures.mirrored)),
+    Fault(
+        "roll and pitch swapped",
+        "Roll is reported as pitch, and pitch as roll.",
+        source=reported(edits.roll_pitch_swapped),
+    ),
+    Fault(
+        "roll and pitch negated",
+        "Roll and pitch are reported with the wrong sign.",
+        source=reported(edits.roll_pitch_negated),
+    ),
+    *(Fault(name, words, source=reported(edits.height_times(factor))) for name, words, factor in HEIGHTS),
+    *(
+        Fault(
+            f"focal length {word}",
+            f"The focal length is {word} in the description, and stated to 1 %.",
+            origin=edits.focal_times(factor),
+        )
+        for word, factor in (("halved", 0.5), ("doubled", 2.0))
+    ),
+    Fault(
+        "frozen picture with noise",
+        "The camera repeats one picture for 15 s, with new noise each time.",
+        FROZEN_S,
+        partial(pictures.stale_buffers, buffers=1),
+    ),
+    Fault(
+        "four stale buffers",
+        "The camera repeats four pictures in turn for 15 s.",
+        FROZEN_S,
+        partial(pictures.stale_buffers, buffers=BUFFERS),
+    ),
+    Fault(
+        "camera falls behind",
+        "For 15 s the pictures play at half their speed, then the camera is live.",
+        FROZEN_S,
+        partial(pictures.falling_behind, lag_s=FROZEN_S / 2),
+    ),
+    Fault(
+        "stream falls behind",
+        "For 40 s the delay of the pictures grows evenly to 2 s, then the camera is live.",
+        40.0,
+        partial(pictures.falling_behind, lag_s=2.0),
+    ),
+    Fault(
+        "picture squeezed in one axis",
+        "16:9 is shown as 4:3 in every picture: one axis has another scale than the description says.",
+        source=shown(pictures.scaled(1.0, 4.0 / 3.0)),
+    ),
+    Fault(
+        "camera upside down",
+        "For 20 s the pictures are turned by 180 degrees, as after a reboot of the camera.",
+        20.0,
+        shown(pictures.upside_down),
+    ),
+    Fault(
+        "foreign frames in a row",
+        "For 5 s the pictures are mirrored: they agree with each other, and are nowhere on the map.",
+        5.0,
+        shown(pictures.mirrored),
+    ),
+    Fault(
+        "half the picture stands still",
+        "The lower half of every picture shows a part of the vehicle, from the first frame on.",
+        source=whole(pictures.partly_frozen(STILL_SHARE, SEED)),
+        needs=PIXELS,
+    ),
+    Fault(
+        "telemetry 2 s late",
+        "All that the autopilot reports is two seconds old when it gets its time.",
+        source=whole(edits.late_telemetry(LATE_TELEMETRY_S)),
+    ),
+    Fault(
+        "pictures 1 s late",
+        "Every picture is a second old when it gets its time.",
+        source=whole(pictures.late_pictures(LATE_S)),
+    ),
+    Fault(
+        "forged tilt",
+        "For 10 s a roll is reported that is 15 degrees more than the true one.",
+        FORGED_S,
+        reported(edits.rolled(15.0)),
+    ),
+    Fault(
+        "forged heading", "For 10 s the reported heading jumps by 90 degrees.", FORGED_S, reported(edits.turned(90.0))
+    ),
+)
+# True inputs, of which some are missing or imprecise: the position must stay good.
+SCARCE_INPUTS = (
+    Fault(
+        "dropped and doubled frames",
+        "15 % of the frames are missing, 15 % come twice.",
+        source=whole(edits.dropped_and_doubled(DROPPED, DOUBLED, SEED)),
+        is_true=True,
+    ),
+    Fault(
+        "height unknown", "No height is reported.", source=reported(edits.height_unknown), needs=UNKNOWN, is_true=True
+    ),
+    Fault(
+        "start unknown", "No start is known.", origin=edits.start_unknown, needs=frozenset({Need.SEARCH}), is_true=True
+    ),
+)
+# Within what is promised.
+IMPRECISE_INPUTS = (
+    Fault(
+        "height wrong by 10 %",
+        "The reported height is 10 % too large.",
+        source=reported(edits.height_times(1.10)),
+        is_true=True,
+    ),
+    Fault(
+        "compass wrong by 15 degrees",
+        "The reported heading is off by 15 degrees.",
+        source=reported(edits.turned(15.0)),
+        is_true=True,
+    ),
+    Fault(
+        "heading unknown", "No heading is reported.", source=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
+    ),
+)
+INPUTS = {fault.name: fault for fault in (*CAMERA, *FALSE_INPUTS)}
+SCENARIOS: tuple[Fault, ...] = (  # of several faults
+    in_turn(
+        "camera reboots upside down",
+        "No frame for 6 s, then the pictures are turned by 180 degrees for 20 s.",
+        INPUTS["camera: unplugged"],
+        INPUTS["camera upside down"],
+    ),
+)
+MATRIX = (NONE, *KILLED_AND_LIMITED, *CAMERA, *AROUND_THEM)  # what `terrafix chaos` flies if no fault is named
+FAULTS = {fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *SCENARIOS)}
+
+
+def fault_named(name: str) -> Fault:
+    """Raises UsageError."""
+    if name not in FAULTS:
+        raise UsageError(f"'{name}' is no fault; 'terrafix chaos --list' names them")
+    return FAULTS[name]
