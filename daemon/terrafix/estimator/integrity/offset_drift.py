@@ -10,7 +10,7 @@ GRID_S = np.arange(-2.0, 3.0001, STEP_S)
 RESOLUTION_S2 = STEP_S**2 / 12.0  # s^2 [spec: variance of a uniform density over a grid cell]
 # s/s at which an offset may drift; 0 first. A buffer fills by what a receiver is slower: 2 to 40 %, and empties again.
 RATES = np.array([0.0, -0.4, -0.1, 0.02, 0.05, 0.1, 0.2, 0.4])  # [spec: the last one fills the grid in 8 s]
-STOP_HZ = 1.0 / 20.0  # a drift ends after 20 s in the mean: a buffer is full [tuned]
+STOP_HZ = 1.0 / 20.0  # a drift ends after 20 s in the mean: a buffer is full [spec: half of 2 s in 40 s]
 
 
 @dataclass(frozen=True)

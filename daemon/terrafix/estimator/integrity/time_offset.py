@@ -17,6 +17,7 @@ import numpy as np
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_S2, Hazards, predicted
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.estimator.monitors.levelling import ACCELERATION_SIGMA_MPS2
 from terrafix.estimator.monitors.visual_motion import MIN_DOWN, MIN_PAIRS
 from terrafix.messages import CalibrationFault, Odometry, Verdict
 
@@ -32,8 +33,8 @@ MAX_PAIRS = 24  # of an image, spread over it: more do not improve what the atti
 # ns between two frames that are compared: the error of an attitude grows slower than what the vehicle turns.
 MIN_SPAN_NS = 400_000_000  # [measured: docs/decisions/058]
 MIN_TURN_SIGMA_RAD, MIN_TILT_SIGMA_RAD = np.radians(0.1), np.radians(0.05)  # of changes between two frames [tuned]
-MOUNT_SIGMA_RAD = np.radians(3.0)  # 1-sigma of the mount's tilt, by which a roll looks like a turn, or a jump [tuned]
-ACCELERATION_SIGMA_MPS2 = 3.0  # of a vehicle without inertial readings [tuned: monitors/levelling.py]
+# 1-sigma of the mount's tilt, by which a roll looks like a turn, or a jump [spec: twice that of turn_comparison.py]
+MOUNT_SIGMA_RAD = np.radians(3.0)
 INERTIAL_SIGMA_MPS2 = 0.2  # with them: a tilt that is wrong by a degree [spec: attitude_sigma_deg]
 NOISE_MEMORY = 50.0  # comparisons: time constant of the noise [tuned]
 INDEPENDENT_SHARE = 0.5  # of the comparisons: two consecutive ones share a frame [tuned]
@@ -43,7 +44,7 @@ MAX_NATS = 6.0  # of one comparison: twice MAX_STEP of the monitors [spec: monit
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
 APPLY_MAX_SIGMA_S = 0.25  # s: largest 1-sigma of an offset that is applied [tuned]
 MAX_SLEW = 0.2  # s/s: rate of change of the applied offset [tuned]
-REPORT_EVERY_S = 0.5  # s: change of a reported offset that is reported again [tuned]
+REPORT_EVERY_S = 0.5  # s: change of a reported offset that is reported again [spec: 10 m at 20 m/s]
 QUANTITY = "camera time"
 
 

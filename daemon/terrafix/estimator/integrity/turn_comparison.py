@@ -9,17 +9,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.estimator.integrity.offset_drift import STEP_S
+from terrafix.estimator.integrity.time_offset import (
+    INDEPENDENT_SHARE,
+    PRIOR_SIGMA_S,
+    REPORT_WAIT_NS,
+    UNSTAMPED_SHARE,
+)
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 
-GRID_S = np.arange(-2.0, 2.0001, 0.05)  # s: offsets of the density [tuned]
-# 1-sigma of the offset of frames that are stamped on arrival: exposure, readout and transfer of USB cameras [s].
-PRIOR_SIGMA_S = 0.03  # [tuned]
-UNSTAMPED_SHARE = 0.01  # of cameras whose buffers or pipeline may delay by anything on the grid [tuned]
+GRID_S = np.arange(-2.0, 2.0001, STEP_S)  # s: offsets of the density [spec: offset_drift.py, to 2 s both ways]
 MIN_TURN_SIGMA_RAD = np.radians(0.3)  # lower limit of the 1-sigma of a turn between two frames [tuned]
 MOUNT_PITCH_SIGMA_RAD = np.radians(1.5)  # 1-sigma of the mount pitch that remains after its calibration [tuned]
-INDEPENDENT_SHARE = 0.5  # of the turns: two consecutive ones share a reported heading and a keyframe [tuned]
 MEMORY_TURNS = 300.0  # turns: time constant of the exponential forgetting of the sums [tuned]
-REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
 
 
 @dataclass(frozen=True)
