@@ -20,10 +20,16 @@ def fault_text(fault: CalibrationFault) -> str:
             return f"camera {fault.factor:.1f} s late: corrected" if fault.factor else "camera time is right again"
         late, which = abs(fault.factor), "camera" if fault.factor > 0.0 else "telemetry"
         return f"{which} {late:.1f} s late: check its buffers"
+    if fault.quantity.startswith("picture"):
+        turned = "" if fault.factor is None else f" by {fault.factor:.0f} deg"
+        return f"{fault.quantity}{turned}: not used" if fault.active else "the picture is right again"
     if not fault.active:
         return f"{fault.quantity} is plausible again"
     if fault.factor is None:
         return f"{fault.quantity}: no fix"
+    if fault.quantity == "aspect ratio":
+        axis, by = ("x", 1.0 / fault.factor) if fault.factor < 1.0 else ("y", fault.factor)
+        return f"picture squeezed by {by:.2f} in {axis}: no fix"
     if fault.quantity == "scale":
         return f"height/focal seems x{fault.factor:.2f} off: no fix"
     return f"{fault.quantity} off by {fault.factor:.0f} deg: no fix"
