@@ -1,6 +1,7 @@
 """Visual odometry as a measurement: the motion of a frame over the ground since its keyframe, gated against the motion
 model, and what three keyframes saw together."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
