@@ -140,6 +140,8 @@ class Frame(Message, frozen=True, kw_only=True):
     width: int
     height: int
     error: str = ""  # not empty: the frame has no pixels; this is the reason
+    # A buffer may lie between exposure and ``t_ns``: the stamp is of arrival, or by the sender of a network stream.
+    buffered: bool = False
 
 
 class VehicleState(Message, frozen=True, kw_only=True):
@@ -510,11 +512,12 @@ class CalibrationFault(Message, frozen=True, kw_only=True):
 
     ``quantity``: "scale" (height or focal length), "mount yaw", "heading", "attitude", "aspect ratio", "mirrored
     picture", "registration" (frames match the map nowhere, for an unknown reason); and of images that are refused since
-    a moment of the flight "picture upside down", "picture turned", "picture mirrored"."""
+    a moment of the flight "picture upside down", "picture turned", "picture mirrored";
+    "camera time" (stamps against the autopilot), "start" (the vehicle stood on what moves)."""
 
     quantity: str
     # scale: reported over true height; aspect ratio: scale of the image's x axis over that of y; angles: reported less
-    # true, degrees; None: unknown
+    # true, degrees; time: s late; None: unknown
     factor: float | None
     detail: str  # evidence of the fault
     active: bool

@@ -117,6 +117,7 @@ class FilterState:
         self.last_fix_s: float | None = None
         # First node of the flight that a place stands behind: a start that is known, or a map match of its graph.
         self.first_placed_node: int | None = None
+        self.start_moved = False  # the vehicle stood on what moves, and no map match has placed it since
         self.first_node = 0  # of the present graph, since the last reset
         self.last_fused_s = 0.0  # time of the newest frame with fused odometry or an accepted map match
         self.has_height = False
@@ -149,8 +150,13 @@ class FilterState:
 
     def on_placed(self) -> None:
         """A place stands behind all nodes of the present graph."""
+        self.start_moved = False
         if self.first_placed_node is None:
             self.first_placed_node = self.first_node
+
+    def on_start_moved(self) -> None:
+        """The start is no place: the vehicle was carried away from it."""
+        self.first_placed_node, self.start_moved = None, True
 
     def add_factors(self, node: int, *factors: gtsam.NonlinearFactor) -> None:
         """Factors of the variables of ``node``, of a measurement that was accepted."""

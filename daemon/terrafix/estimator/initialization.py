@@ -7,6 +7,7 @@ from enum import StrEnum
 import gtsam
 import numpy as np
 
+from terrafix.core.gate import GATE
 from terrafix.core.pose import tangent_to_world, world_to_tangent
 from terrafix.estimator.filter_state import FilterState, FrameContinuity, FrameInput, FrameState, scale_sigma
 from terrafix.estimator.graph.pose_graph import GraphPrior
@@ -22,14 +23,21 @@ from terrafix.estimator.measurements.attitude_height import (
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.bias_walk import walk_sigmas
 from terrafix.estimator.models.lens_prior import radial_k1_sigma
-from terrafix.estimator.models.motion_model import MotionIncrement, stationary_motion_cov, unknown_motion_cov
+from terrafix.estimator.models.motion_model import (
+    MotionIncrement,
+    predict_covariance,
+    stationary_motion_cov,
+    unknown_motion_cov,
+)
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.prior import NavPrior
 from terrafix.estimator.state import (
     CALIBRATION_SIZE,
     DELTA_MOTION,
     DELTA_P,
+    HEADING,
     HEIGHT,
+    HORIZONTAL,
     LOG_HEIGHT_SCALE,
     MOTION_SIZE,
     VELOCITY,
@@ -39,6 +47,7 @@ from terrafix.estimator.state import (
 )
 from terrafix.messages import Origin
 
+STARTS_MOVING = 3  # frames: one may show what wind or wash moves [spec: MIN_CONSISTENT, map_update.py]
 FLYING_M = 20.0  # above the ground: a vehicle that is seen to move there has taken off [tuned]
 # What an autopilot's own sigma leaves out: a compass beside motors and wires, a barometer over ground that is higher or
 # lower than at take-off. On real flights the heading was 12 degrees and the height 8 % away from the log, and a compass
@@ -61,6 +70,7 @@ class ResetReason(StrEnum):
     HEADING_UNKNOWN = "unseen motion without a reported heading"
     MOTION_TIMEOUT = "odometry contradicts velocity"
     VELOCITY = "odometry innovations of one sign"
+    MOVING_START = "seen to move as no standing vehicle does after its take-off"
     UNMEASURED_TAKE_OFF = "in flight after a take-off that nothing measured"
     TOO_LOW = "height below that of map matching"
     MAP_MATCH = "map match"
@@ -259,10 +269,33 @@ class TakeOffDetector:
 
     def __init__(self) -> None:
         self.launching = False
+        # V (8,) and its covariance (8, 8) by inertial readings alone, since the vehicle stood. None: no readings.
+        self._inertial: tuple[np.ndarray, np.ndarray] | None = None
+        self._contradicted = 0  # frames in a row
         self._unmeasured = False  # a part of the take-off had no inertial readings either
 
     def stood(self) -> None:
-        self.launching = True
+        self.launching, self._contradicted = True, 0
+        self._inertial = np.zeros(MOTION_SIZE), stationary_motion_cov()
+
+    def start_off_mps(self, before: NodeState, increment: MotionIncrement | None, *, seen: bool) -> np.ndarray | None:
+        """(2,) [m/s] by which velocity differs from that of a vehicle that stood on the ground, where it does so beyond
+        what inertial readings leave open (chi-square, 99.9 %, in STARTS_MOVING frames in a row): disarmed is evidence
+        for standing, but a vehicle on a deck stands on what moves. ``before``: the newest node, to which odometry
+        belongs if ``seen``; ``increment``: from there on. None: it does not."""
+        if self._inertial is None or increment is None:
+            return None
+        motion, cov = self._inertial
+        off_mps = (before.motion - motion)[HORIZONTAL]
+        distance2 = float(off_mps @ np.linalg.solve(cov[HORIZONTAL, HORIZONTAL], off_mps))
+        self._contradicted = self._contradicted + 1 if seen and distance2 > GATE[2] else 0
+        if self._contradicted >= STARTS_MOVING:
+            self._inertial = None
+            return np.asarray(off_mps)
+        _, motion = increment.predict(np.zeros(3), motion, float(before.calibration[HEADING]))
+        cov = predict_covariance(increment, cov)[DELTA_MOTION, DELTA_MOTION]
+        self._inertial = (motion, cov) if increment.inertial else None
+        return None
 
     def was_unmeasured(self, increment: MotionIncrement | None, seen_at_m: float | None) -> bool:
         """The vehicle is seen in flight after a take-off that neither images nor IMU measured. ``increment``: to the

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
 import msgspec
 import numpy as np
 
+from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
 from terrafix.core.node import Edge, NodeContext
@@ -42,10 +42,12 @@ from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpo
 from terrafix.estimator.propagation import PropagationResult
 from terrafix.estimator.smoother_inputs import map_anchor, odometry_link, relocalization_link
 from terrafix.messages import (
+    CalibrationFault,
     CandidateAttitude,
     ClaimBudget,
     CovarianceMode,
     EkfDeadReckoning,
+    Frame,
     Health,
     Imu,
     InitialPosition,
@@ -69,6 +71,7 @@ TELEMETRY_WAIT_NS = 1_000_000_000  # the autopilot's heartbeat comes once a seco
 COOL = Health(
     t_ns=0, band=ThermalBand.NORMAL, temperature_c=None, throttled=False, disk_free_mb=None, cause="no reading yet"
 )
+START_QUANTITY = "start"
 BEFORE_TELEMETRY = "older than the autopilot's first messages after the restart"
 
 MakeEstimator = Callable[[Origin, NavPrior | None], Estimator]
@@ -114,6 +117,7 @@ class EstimatorNode:
         self._relocated = False  # a relocalisation has moved the estimate since
         self._monitors: Monitors | None = None
         self._rebuilds = 0  # of the graph
+        self._start_moved = False  # as reported
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
             Origin: self._on_origin,
             InitialPosition: self._on_initial_position,
@@ -123,6 +127,7 @@ class EstimatorNode:
             CandidateAttitude: self._on_candidate_attitude,
             EkfDeadReckoning: self._on_dead_reckoning,
             Health: self._on_health,
+            Frame: self._on_frame,
             Odometry: self._on_odometry,
             Relocalization: self._on_relocalization,
             MapMatch: self._on_map_match,
@@ -165,7 +170,8 @@ class EstimatorNode:
         self._axes = LocalFrame(origin.lat_deg, origin.lon_deg)
         self._predicted_id = None  # in other axes
         prior = self._prior(origin, self._axes)
-        self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior), TimeOffset())
+        offset = TimeOffset(Mount.of(origin.camera).r_b_c())
+        self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior), offset)
         waiting, self._early_dead_reckoning = self._early_dead_reckoning, []
         for sample in waiting:
             yield from self._on_dead_reckoning(sample)
@@ -247,6 +253,11 @@ class EstimatorNode:
 
     # --- frames --------------------------------------------------------------------------------------------------
 
+    def _on_frame(self, frame: Frame) -> Iterable[Message]:
+        if self._flight is not None:
+            self._flight.time_offset.buffered = frame.buffered
+        return ()
+
     def _on_odometry(self, odometry: Odometry) -> Iterable[Message]:
         self._waiting.append(odometry)
         return self._waiting_frames()
@@ -274,8 +285,7 @@ class EstimatorNode:
     def _frame(self, odometry: Odometry) -> Iterable[Message]:
         if self._estimator is None or self._flight is None:
             return
-        stamp_ns, time_offset = odometry.t_ns, self._flight.time_offset
-        before_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
+        stamped, time_offset = odometry, self._flight.time_offset
         if (camera_vehicle := self._camera_vehicle.on_odometry(odometry, self._estimator.origin.camera)) is not None:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
@@ -284,8 +294,6 @@ class EstimatorNode:
         self._relocated = False
         result = estimator.feed_frame(frame)
         self._tracked = result.verdict is Verdict.ACCEPTED
-        if result.turn is not None:
-            time_offset.add(replace(result.turn, t0_ns=before_ns, t1_ns=stamp_ns), self._telemetry)
         verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
         fragment = estimator.state.fragment_of(odometry.frame_id)
         yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict, fragment) for verdict in verdicts)
@@ -303,6 +311,9 @@ class EstimatorNode:
             orientation = estimator.state.orientation.fault
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
+            time_offset.add(stamped, self._telemetry, agl_m)
+            yield from time_offset.take_changes(odometry.t_ns)
+        yield from self._start_fault(estimator, odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:
             yield ClaimBudget(t_ns=odometry.t_ns, frame_id=odometry.frame_id, terms_m2=budget.terms_m2)
@@ -311,6 +322,14 @@ class EstimatorNode:
             self._ahrs.position_published(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
         yield from odometry_link(estimator, result, odometry.t_ns)  # last: it delays nothing
+
+    def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
+        moved = estimator.state.start_moved
+        if moved == self._start_moved:
+            return
+        self._start_moved = moved
+        detail = "the vehicle moves as if it had stood on what moves" if moved else "the map has placed it"
+        yield CalibrationFault(t_ns=t_ns, quantity=START_QUANTITY, factor=None, detail=detail, active=moved)
 
     def _in_telemetry_time(self, odometry: Odometry, time_offset: TimeOffset) -> Odometry:
         """``odometry``, with the estimated time offset of the camera taken from its time."""

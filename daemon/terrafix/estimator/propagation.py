@@ -15,7 +15,6 @@ from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffD
 from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
 from terrafix.estimator.integrity.signed_innovations import SignedInnovations
-from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning, DeadReckoningAid
@@ -59,15 +58,14 @@ MOTION_TIMEOUT_S = 5.0  # of a vehicle with inertial aiding alone [spec: EKF2_NO
 @dataclass(frozen=True)
 class PropagationResult:
     """Result of ``advance``. ``verdict``: on the odometry of the frame. ``step_m`` (2,): east, north since the frame
-    before, by odometry alone, and its 1-sigma. ``turn``: since the frame before, by images. ``verdicts``: on all
-    measurements, and on a reset of the graph, in the order in which they were made. ``motion``: since the keyframe, by
-    odometry, also of a fragment that is not confirmed; None: there is none, or a graph has begun with the frame."""
+    before, by odometry alone, and its 1-sigma. ``verdicts``: on all measurements, and on a reset of the graph, in the
+    order in which they were made. ``motion``: since the keyframe, by odometry, also of a fragment that is not
+    confirmed; None: there is none, or a graph has begun with the frame."""
 
     verdict: Verdict
     placed: FrameState
     step_m: np.ndarray
     step_sigma_m: float
-    turn: Turn | None = None
     verdicts: tuple[FusionVerdict, ...] = ()
     motion: KeyframeMotion | None = None
 
@@ -115,13 +113,12 @@ class Propagation:
         before = state.graph.state(state.graph.newest)
         increment = functools.cache(lambda: self._increment(frame, before, fused=True))
         odometry = self._odometry.gated(frame, before, increment)
-        turn = self._odometry.turn(odometry)
         rejected = self._gate_heading(frame, odometry, before)
         if rejected is not None and self._heading_gate.should_reinitialise and state.last_fix_s is None:
             return self._initialize(frame, ResetReason.HEADING_GATE, rejected)
         if rejected is not None:
             frame = replace(frame, attitude=replace(frame.attitude, yaw_rad=None))
-        predicted = self._predict(frame, before, odometry, turn, increment if rejected is None else None)
+        predicted = self._predict(frame, before, odometry, increment if rejected is None else None)
         verdicts = [FusionVerdict("odometry", odometry.verdict, odometry.innovation)]
         verdicts += [] if rejected is None else [rejected]
         if result := self._reset_before_fusion(predicted, verdicts):
@@ -144,7 +141,6 @@ class Propagation:
         frame: FrameInput,
         before: NodeState,
         odometry: GatedOdometry,
-        turn: Turn | None,
         fused_increment: Callable[[], MotionIncrement] | None,
     ) -> PredictedFrame:
         """Motion model. ``fused_increment``: the increment of a frame with fused odometry, where it is known
@@ -161,7 +157,7 @@ class Propagation:
         p_m, motion = before.pose.translation(), np.zeros(MOTION_SIZE)
         if increment is not None:
             p_m, motion = increment.predict(p_m, before.motion, float(before.calibration[HEADING]))
-        return PredictedFrame(frame, before, odometry, turn, increment, p_m, motion, cov)
+        return PredictedFrame(frame, before, odometry, increment, p_m, motion, cov)
 
     def _increment(self, frame: FrameInput, before: NodeState, *, fused: bool) -> MotionIncrement:
         """Increment of the motion model, from ``before``, the newest node, to ``frame``. ``fused``: odometry
@@ -214,6 +210,8 @@ class Propagation:
             detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
             reset = _reset_verdict(ResetReason.VELOCITY, detail)
             return self._continue(replace(predicted, cov=cov), [*verdicts, reset])
+        if (off_mps := self._start_off_mps(predicted)) is not None:
+            return self._leave_start(predicted, off_mps, verdicts)
         above_m = None if odometry.fused is None else float(predicted.p_m[UP]) - state.terrain.ground_m
         if self._take_off.was_unmeasured(predicted.increment, above_m):
             # With the speed known at both ends a graph would be too sure of the distance between them.
@@ -223,6 +221,25 @@ class Propagation:
             verdicts = [*verdicts, _reset_verdict(ResetReason.UNMEASURED_TAKE_OFF)]
             return PropagationResult(Verdict.ACCEPTED, placed, predicted.step_m, sigma_m, verdicts=tuple(verdicts))
         return self._reset_yaw_gauge(predicted, verdicts)
+
+    def _start_off_mps(self, predicted: PredictedFrame) -> np.ndarray | None:
+        if self._state.last_fix_s is not None:  # the map tells where it started
+            return None
+        seen = self._state.continuity.keyframe_motion is not None and predicted.odometry.motion is not None
+        return self._take_off.start_off_mps(predicted.before, predicted.increment, seen=seen)
+
+    def _leave_start(
+        self, predicted: PredictedFrame, off_mps: np.ndarray, verdicts: list[FusionVerdict]
+    ) -> PropagationResult:
+        """The vehicle stood on what moves with ``off_mps`` (2,), for all that is known since the start: that is
+        no place any more."""
+        state, cov = self._state, predicted.cov.copy()
+        way_m = float(np.hypot(*off_mps)) * (predicted.frame.t_s - state.began_s)
+        cov[HORIZONTAL, HORIZONTAL] += way_m**2 * np.eye(2)
+        state.on_start_moved()
+        detail = f"{np.hypot(*off_mps):.1f} m/s at the take-off: the start may have moved by {way_m:.0f} m"
+        reset = _reset_verdict(ResetReason.MOVING_START, detail)
+        return self._continue(replace(predicted, cov=cov), [*verdicts, reset])
 
     def _reset_yaw_gauge(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult | None:
         """A new graph when the heading becomes known, or unobservable in motion without odometry. None: no reset."""
@@ -479,4 +496,4 @@ def _result(
     predicted: PredictedFrame, placed: FrameState, step: Step, verdicts: list[FusionVerdict]
 ) -> PropagationResult:
     verdict = predicted.odometry.verdict
-    return PropagationResult(verdict, placed, step.moved_m, step.sigma_m, predicted.turn, tuple(verdicts))
+    return PropagationResult(verdict, placed, step.moved_m, step.sigma_m, tuple(verdicts))

@@ -10,7 +10,6 @@ import numpy as np
 
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState, FrameInput
-from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.measurements.attitude_height import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.odometry import GatedOdometry, KeyframeMotion
 from terrafix.estimator.models.motion_model import STATIONARY_M, MotionIncrement, fuse_odometry_increment
@@ -23,14 +22,12 @@ STEP_FLOOR_M = 0.5  # [tuned]
 
 @dataclass(frozen=True)
 class PredictedFrame:
-    """A frame after the motion model. ``before``: the newest node; ``turn``: since the frame before, by images;
-    ``increment``: since ``before``, None: the vehicle stands; ``p_m`` (3,) and ``motion`` (8,), V, at its end, and
-    ``cov`` (11, 11) of both."""
+    """A frame after the motion model. ``before``: the newest node; ``increment``: since ``before``, None: the vehicle
+    stands; ``p_m`` (3,) and ``motion`` (8,), V, at its end, and ``cov`` (11, 11) of both."""
 
     frame: FrameInput
     before: NodeState
     odometry: GatedOdometry
-    turn: Turn | None
     increment: MotionIncrement | None
     p_m: np.ndarray
     motion: np.ndarray

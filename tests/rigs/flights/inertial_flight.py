@@ -1,7 +1,7 @@
 """A simulated plane with the sensors of an autopilot, and the odometry and map matches of its
 frames."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import msgspec
@@ -26,7 +26,7 @@ from terrafix.messages import (
     Verdict,
 )
 from terrafix_lab.montecarlo.flown import imu_of
-from terrafix_lab.sim.interfaces import Readings
+from terrafix_lab.sim.interfaces import Readings, State
 from terrafix_lab.sim.sensors.suite import VehicleSensors
 from terrafix_lab.sim.true_messages import first_odometry, map_match, seen_from
 from terrafix_lab.sim.vehicle.plane import Plane
@@ -43,10 +43,17 @@ class InertialFlight:
     """One frame in ``frame_every`` steps: one per second. ``messages_by_frame[i]``: telemetry since the previous frame,
     then odometry and map match.
 
-    Truth per frame: ``poses`` (R_w_c, position of the camera in ENU relative to the start coordinate),
-    ``velocity_mps`` (ENU)."""
+    Truth per frame: ``poses`` of its picture (R_w_c, position of the camera in ENU relative to the start coordinate);
+    at its time stamp ``true_m`` (that position) and ``velocity_mps`` (ENU)."""
 
-    def __init__(self, seed: int, seconds: int = 70, frame_every: int = FRAME_EVERY) -> None:
+    def __init__(
+        self,
+        seed: int,
+        seconds: int = 70,
+        frame_every: int = FRAME_EVERY,
+        delay: Callable[[float], float] = lambda _t_s: 0.0,
+    ) -> None:
+        """``delay``: seconds by which the picture of a frame is older than its time stamp, by that time."""
         rng = np.random.default_rng([seed, 78])
         mission = course(seed, 40.0 * seconds, Box(-1500.0, -1500.0, 1500.0, 1500.0), PLACE, agl_m=120.0)
         plane = Plane(mission, PLACE, lambda e, n: 0.0, wind=Wind(5.4, 1.0), seed=seed)
@@ -55,7 +62,9 @@ class InertialFlight:
         mount = Mount.of(CAMERA).r_b_c() @ exp_so3(np.array([*tilt, 0.0]))
         start = plane.state.p_b_in_w_m[:2] + rng.normal(0.0, ORIGIN.start_sigma_m, 2)
         self.poses: list[tuple[np.ndarray, np.ndarray]] = []
+        self.true_m: list[np.ndarray] = []
         self.velocity_mps: list[np.ndarray] = []
+        states: list[State] = []
         self.messages_by_frame: list[list[Message]] = []
         telemetry: list[Message] = []
         batch: list[Readings] = []
@@ -79,8 +88,11 @@ class InertialFlight:
             if len(batch) == BATCH:
                 telemetry.append(imu_of(batch, "simulated"))
                 batch = []
+            states.append(state)
             if i % frame_every == 0:
-                self.poses.append((state.r_w_b() @ mount, state.p_b_in_w_m - np.array([*start, 0.0])))
+                shown = states[max(0, i - round(delay(state.t_s) / STEP_S))]
+                self.poses.append((shown.r_w_b() @ mount, shown.p_b_in_w_m - np.array([*start, 0.0])))
+                self.true_m.append(state.p_b_in_w_m - np.array([*start, 0.0]))
                 self.velocity_mps.append(state.velocity_enu_mps)
                 frame_id = len(self.messages_by_frame)
                 messages = [*telemetry, self._odometry(frame_id, t_ns, rng)]

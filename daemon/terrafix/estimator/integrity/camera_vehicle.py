@@ -1,6 +1,6 @@
 """Which of several vehicles carries the camera: the one whose attitude turns as the images do.
 
-The comparison is that of the time offset (``TimeOffset``), for each vehicle. Several vehicles may turn alike for a
+The comparison is that of the time offset (``TurnComparison``), for each vehicle. Several vehicles may turn alike for a
 while (two planes that circle, a copy of the telemetry by a forger), so one is confirmed only where no other explains
 the turns nearly as well. A vehicle alone is compared as well: once confirmed it stays so, whoever appears later."""
 
@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from terrafix.core.camera import Mount
-from terrafix.estimator.integrity.time_offset import TimeOffset, Turn
+from terrafix.estimator.integrity.turn_comparison import Turn, TurnComparison
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.monitors.visual_motion import image_turn
 from terrafix.messages import (
@@ -42,7 +42,7 @@ class _Vehicle:
     alone: the telemetry of another vehicle may have led the estimate astray."""
 
     def __init__(self) -> None:
-        self.telemetry, self.comparison = Telemetry(), TimeOffset()
+        self.telemetry, self.comparison = Telemetry(), TurnComparison()
         self._manoeuvres = 0
         self._frame: tuple[int, int, int, float] | None = None  # newest: id, time [ns], keyframe, turn since that
         self._tilt_of_keyframe: dict[int, Attitude] = {}

@@ -1,148 +1,263 @@
-"""Time offset between camera and autopilot, from turns that both observe (the calibration state td of OpenVINS; Qin and
-Shen 2018, "Online temporal calibration for monocular visual-inertial systems").
+"""Time offset between camera and autopilot, from what both observe of the vehicle's rotation (the calibration state td
+of OpenVINS; Qin and Shen 2018, "Online temporal calibration for monocular visual-inertial systems").
 
-A frame with a time stamp that is late by ``offset_s`` shows a turn that much after the autopilot reports it. The offset
-has a density over a grid. Its prior is a mixture: cameras that stamp their frames, and a small share that does not.
-The noise of the turns is marginalised, so that a wandering compass widens the density. So is the error of the camera's
-mount pitch: with a wrong one, a roll of the vehicle looks like a turn, as it does with a time offset."""
+A frame with a time stamp that is late by ``offset_s`` shows the attitude of that much before. Levelled with the
+attitude of the right time, images turn as the heading does, and their velocity changes as the accelerometers say;
+levelled with another one, it jumps wherever the vehicle rolls or pitches. All offsets of a grid are compared.
 
+The offset may drift: the buffer of a stream fills while its receiver is slower than its sender. So it is a hidden
+Markov chain over offset and rate on a grid, a point mass filter (Bucy and Senne 1971): constant, at one of some rates,
+or jumping. How often it begins to drift depends on the source."""
+
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.core.gate import MIN_COMPONENT_WEIGHT
+from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
+from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_S2, Hazards, predicted
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.estimator.monitors.levelling import ACCELERATION_SIGMA_MPS2
+from terrafix.estimator.monitors.visual_motion import MIN_DOWN, MIN_PAIRS
+from terrafix.messages import CalibrationFault, Odometry, Verdict
 
-GRID_S = np.arange(-2.0, 2.0001, 0.05)  # s: offsets of the density [tuned]
-RESOLUTION_S2 = (GRID_S[1] - GRID_S[0]) ** 2 / 12.0  # s^2 [spec: variance of a uniform density over a grid cell]
 # 1-sigma of the offset of frames that are stamped on arrival: exposure, readout and transfer of USB cameras [s].
 PRIOR_SIGMA_S = 0.03  # [tuned]
+FAR_S = 3.0 * PRIOR_SIGMA_S  # s: a larger offset is not that of transfer alone [spec: three sigmas]
 UNSTAMPED_SHARE = 0.01  # of cameras whose buffers or pipeline may delay by anything on the grid [tuned]
-MIN_TURN_SIGMA_RAD = np.radians(0.3)  # lower limit of the 1-sigma of a turn between two frames [tuned]
-MOUNT_PITCH_SIGMA_RAD = np.radians(1.5)  # 1-sigma of the mount pitch that remains after its calibration [tuned]
-INDEPENDENT_SHARE = 0.5  # of the turns: two consecutive ones share a reported heading and a keyframe [tuned]
-MEMORY_TURNS = 300.0  # turns: time constant of the exponential forgetting of the sums [tuned]
+OUTSIDE_S = 5.0  # s, 1-sigma of an offset at the end of the grid, or beyond it [spec: the width of the grid]
+# Hazard of a buffer that lies between exposure and stamp: one that begins to fill in an hour of flight, one that jumps
+# in five; elsewhere a false alarm of the monitors. [spec: FALSE_ALARM_HOURS, monitors/cusum.py, at a stamp of exposure]
+BUFFERED, STAMPED = Hazards(1.0 / 3600.0, 0.2 / 3600.0), Hazards(1.0 / 3.6e6, 1.0 / 3.6e6)
+MAX_PAIRS = 24  # of an image, spread over it: more do not improve what the attitude's noise limits [measured: 40 pairs]
+# ns between two frames that are compared: the error of an attitude grows slower than what the vehicle turns.
+MIN_SPAN_NS = 400_000_000  # [measured: docs/decisions/058]
+MIN_TURN_SIGMA_RAD, MIN_TILT_SIGMA_RAD = np.radians(0.1), np.radians(0.05)  # of changes between two frames [tuned]
+# 1-sigma of the mount's tilt, by which a roll looks like a turn, or a jump [spec: twice that of turn_comparison.py]
+MOUNT_SIGMA_RAD = np.radians(3.0)
+INERTIAL_SIGMA_MPS2 = 0.2  # with them: a tilt that is wrong by a degree [spec: attitude_sigma_deg]
+NOISE_MEMORY = 50.0  # comparisons: 20 s [spec: twice attitude_slow_s, terrafix_lab/sim/sensors/errors.py]
+INDEPENDENT_SHARE = 0.5  # of the comparisons: two consecutive ones share a frame [tuned]
+# Least share of the noise that the images have. Without a limit two of three healthy flights had a false offset.
+MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
+MAX_NATS = 6.0  # of one comparison: twice MAX_STEP of the monitors [spec: monitors/cusum.py]
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
-APPLY_MIN_SIGMAS = 4.0  # 1-sigmas by which an offset differs from 0 before it is applied [tuned]
-APPLY_MAX_SIGMA_S = 0.1  # s: largest 1-sigma of an offset that is applied [tuned]
+APPLY_MAX_SIGMA_S = 0.25  # s: largest 1-sigma of an offset that is applied [tuned]
 MAX_SLEW = 0.2  # s/s: rate of change of the applied offset [tuned]
+REPORT_EVERY_S = 0.5  # s: change of a reported offset that is reported again [spec: 10 m at 20 m/s]
+QUANTITY = "camera time"
 
 
 @dataclass(frozen=True)
-class Turn:
-    """Change of heading from ``t0_ns`` to ``t1_ns`` as images show it, clockwise."""
+class _View:
+    """Ray pairs (N, 4) of a keyframe and a frame, and the time stamps of both."""
 
-    t0_ns: int
-    t1_ns: int
-    yaw_rad: float
+    frame_id: int
+    keyframe_id: int
+    keyframe_ns: int
+    t_ns: int
+    pairs: np.ndarray
+    agl_m: float
+
+
+@dataclass(frozen=True)
+class _Levelled:
+    """Levelled at each offset: ``moved`` (L,) complex, displacement since some keyframe [heights, east + j north];
+    ``turned_rad`` (L,) by which the turn since then differs from the reported one; ``tilt`` (L,): sines of roll and
+    pitch, as complex numbers."""
+
+    t_ns: int
+    moved: np.ndarray
+    turned_rad: np.ndarray
+    tilt: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Velocity:
+    """(L,) complex [heights/s, east + j north] over ``span_s`` about ``middle_ns``, and the part (L,) of its variance
+    that an error of the mount explains."""
+
+    middle_ns: int
+    span_s: float
+    mean: np.ndarray
+    mount2: np.ndarray
 
 
 class TimeOffset:
-    """``applied_s``: the offset to subtract from the time stamps of frames; 0 until it is significant."""
+    """``applied_s``: the offset to subtract from the time stamps of frames; 0 until it is significant.
 
-    def __init__(self) -> None:
+    ``r_b_c`` (3, 3): mount of the camera. ``buffered``: whether a buffer may lie between exposure and stamp."""
+
+    def __init__(self, r_b_c: np.ndarray) -> None:
         self.applied_s = 0.0
-        self._pending: list[Turn] = []  # until attitudes have arrived that are as late as the grid reaches
-        # Sums over turns, for each offset of the grid: squares of the residual "visual less reported turn", products of
-        # residual and change of roll, squares of the change of roll, squares of the visual and of the reported turn.
-        self._residual2, self._residual_roll, self._roll2, self._turned2 = np.zeros((4, len(GRID_S)))
-        self._count = 0.0
+        self.buffered = False
+        self._r_b_c = r_b_c
+        self._stamps_ns: dict[int, int] = {}  # frame -> stamp, of frames that may be the keyframe of a later one
+        self._pending: deque[_View] = deque()  # until attitudes have arrived that are as late as the grid reaches
+        # Frames that may be the keyframe of a later one, since the same keyframe, and the newest that was compared.
+        self._chain: dict[int, _Levelled] = {}
+        self._before: _Levelled | None = None
+        self._velocity: _Velocity | None = None
+        stamped = np.exp(-0.5 * (GRID_S / PRIOR_SIGMA_S) ** 2)
+        self._mass = np.zeros((len(RATES), len(GRID_S)))  # at ``_at_ns``
+        self._mass[0] = (1.0 - UNSTAMPED_SHARE) * stamped / stamped.sum() + UNSTAMPED_SHARE / len(GRID_S)
+        self._at_ns: int | None = None  # stamp of the newest frame that was compared ...
+        self._newest_ns = 0  # ... and of the newest one
+        # Variances of turns [rad^2] and of changes of velocity [heights^2/s^2, each axis]: first guess, then learnt.
+        self._noise = [np.radians(0.5) ** 2, 0.02**2]
+        self._density: np.ndarray | None = None  # of the newest frame
+        self._reported_s: float | None = None
 
-    def add(self, turn: Turn, telemetry: Telemetry) -> None:
-        """A turn between two frames, at their uncorrected time stamps."""
-        self._pending.append(turn)
-        self.compare(telemetry, turn.t1_ns)
-
-    def compare(self, telemetry: Telemetry, frame_ns: int) -> None:
-        """Compares the turns for which all attitudes have arrived. ``frame_ns``: time stamp of the newest frame."""
-        newest_ns = telemetry.newest_turn_ns
-        reach_ns = round(GRID_S[-1] * 1e9) + REPORT_WAIT_NS
-        while self._pending and self._pending[0].t1_ns + reach_ns <= newest_ns:
-            self._accumulate(self._pending.pop(0), telemetry)
-        while self._pending and self._pending[0].t1_ns + 2 * reach_ns < frame_ns:  # no heading is reported
-            del self._pending[0]
-
-    @property
-    def density(self) -> tuple[np.ndarray, float]:
-        """-> probabilities over ``GRID_S``, and the probability of a camera that does not stamp its frames."""
-        stamped, unstamped = (
-            (1.0 - UNSTAMPED_SHARE) * _normal(GRID_S, PRIOR_SIGMA_S),
-            np.full(len(GRID_S), UNSTAMPED_SHARE / (GRID_S[-1] - GRID_S[0])),
-        )
-        if self._count > 0.0:
-            log = self._log_likelihood(self._noise)
-            likelihood = np.exp(log - log.max())
-            stamped, unstamped = stamped * likelihood, unstamped * likelihood
-        total = float(stamped.sum() + unstamped.sum())
-        return (stamped + unstamped) / total, float(unstamped.sum()) / total
-
-    @property
-    def evidence(self) -> tuple[float, float]:
-        """-> log of the likelihood ratio "the attitude turns as the images do, at an unknown offset" over "it turns
-        independently of them", near 0 without turns; and the same for a single turn."""
-        if self._count == 0.0:
-            return 0.0, 0.0
-        prior = (1.0 - UNSTAMPED_SHARE) * _normal(GRID_S, PRIOR_SIGMA_S)
-        prior += UNSTAMPED_SHARE / (GRID_S[-1] - GRID_S[0])
-        independent = self._turned2 / self._count + MIN_TURN_SIGMA_RAD**2
-        log = self._log_likelihood(self._noise) - self._log_likelihood(independent)
-        total = float(log.max() + np.log(prior / prior.sum() @ np.exp(log - log.max())))
-        return total, total / (0.5 * INDEPENDENT_SHARE * self._count)
+    def add(self, odometry: Odometry, telemetry: Telemetry, agl_m: float) -> None:
+        """A frame, at its uncorrected time stamp."""
+        self._stamps_ns = {frame: t for frame, t in self._stamps_ns.items() if frame >= odometry.keyframe_id}
+        self._stamps_ns[odometry.frame_id] = self._newest_ns = odometry.t_ns
+        self._density = None
+        keyframe_ns = self._stamps_ns.get(odometry.keyframe_id)
+        seen = odometry.verdict is Verdict.ACCEPTED and len(odometry.two_view) >= MIN_PAIRS
+        if seen and keyframe_ns is not None and keyframe_ns < odometry.t_ns:
+            pairs = np.array(odometry.two_view[:: max(1, len(odometry.two_view) // MAX_PAIRS)])
+            frames = odometry.frame_id, odometry.keyframe_id, keyframe_ns, odometry.t_ns
+            self._pending.append(_View(*frames, pairs, max(agl_m, 1.0)))
+        reach_ns = round(-GRID_S[0] * 1e9) + REPORT_WAIT_NS
+        while self._pending and self._pending[0].t_ns + reach_ns <= telemetry.newest_turn_ns:
+            self._compare(self._pending.popleft(), telemetry)
+        while self._pending and self._pending[0].t_ns + 2 * reach_ns < odometry.t_ns:  # no attitude is reported
+            self._pending.popleft()
 
     @property
-    def _noise(self) -> np.ndarray:
-        """Variance of the residual turns at each offset, without what an error of the mount pitch explains [rad^2]."""
-        noise = self._residual2 / self._count + MIN_TURN_SIGMA_RAD**2
-        by_mount = self._residual_roll**2 / (self._roll2 + noise / MOUNT_PITCH_SIGMA_RAD**2)
-        return np.asarray(noise - by_mount / self._count)
-
-    def _log_likelihood(self, variance: np.ndarray) -> np.ndarray:
-        """Of the turns so far, whose ``variance`` is that of their own mean square."""
-        return np.asarray(-0.5 * INDEPENDENT_SHARE * self._count * np.log(variance))
+    def density(self) -> np.ndarray:
+        """Probabilities over ``GRID_S`` at the newest frame."""
+        if self._density is None:
+            since_s = 0.0 if self._at_ns is None else (self._newest_ns - self._at_ns) * 1e-9
+            self._density = predicted(self._mass, since_s, self._hazards).sum(axis=0)
+        return self._density
 
     @property
     def estimate(self) -> tuple[float, float]:
         """Mean and 1-sigma of the density [s]."""
-        density, _ = self.density
-        mean = float(density @ GRID_S)
-        return mean, float(np.sqrt(density @ (GRID_S - mean) ** 2 + RESOLUTION_S2))
+        mean_s = float(self.density @ GRID_S)
+        return mean_s, self._sigma_about(mean_s)
 
     @property
     def sigma_s(self) -> float:
         """1-sigma of the offset that remains after correction.
 
-        The prior's sigma limits it until the probability of a camera that does not stamp its frames reaches
-        MIN_COMPONENT_WEIGHT, where that component affects a 95 % ellipse."""
-        density, unstamped = self.density
-        remaining_s = float(np.sqrt(density @ (GRID_S - self.applied_s) ** 2 + RESOLUTION_S2))
-        return remaining_s if unstamped >= MIN_COMPONENT_WEIGHT else min(remaining_s, PRIOR_SIGMA_S)
+        The prior's sigma limits it until the probability of an offset that transfer does not explain reaches
+        MIN_COMPONENT_WEIGHT, where it affects a 95 % ellipse."""
+        remaining_s = self._sigma_about(self.applied_s)
+        if float(self.density[-2:].sum() + self.density[:2].sum()) >= MIN_COMPONENT_WEIGHT:
+            return max(remaining_s, OUTSIDE_S)
+        return remaining_s if self._far(self.applied_s) >= MIN_COMPONENT_WEIGHT else min(remaining_s, PRIOR_SIGMA_S)
 
     def step(self, dt_s: float) -> None:
-        """Moves ``applied_s`` towards the estimate if that is significant, else towards 0. ``dt_s``: since the last
-        frame."""
+        """Moves ``applied_s`` towards the estimate where that is known and not 0, towards 0 where it is 0; elsewhere it
+        stays. ``dt_s``: since the last frame."""
         mean_s, sigma_s = self.estimate
-        significant = sigma_s < APPLY_MAX_SIGMA_S and abs(mean_s) > APPLY_MIN_SIGMAS * max(sigma_s, PRIOR_SIGMA_S)
-        target_s = mean_s if significant else 0.0
+        far, target_s = self._far(0.0), self.applied_s
+        if far >= 1.0 - MIN_COMPONENT_WEIGHT and sigma_s < APPLY_MAX_SIGMA_S:
+            target_s = mean_s
+        elif far <= 0.5:
+            target_s = 0.0
         max_step_s = MAX_SLEW * max(dt_s, 0.0)
         self.applied_s += float(np.clip(target_s - self.applied_s, -max_step_s, max_step_s))
 
-    def _accumulate(self, turn: Turn, telemetry: Telemetry) -> None:
-        shift_ns = np.round(GRID_S * 1e9).astype(np.int64)
-        before, after = (telemetry.turned_about(t_ns - shift_ns) for t_ns in (turn.t0_ns, turn.t1_ns))
-        if before is None or after is None:
+    def take_changes(self, t_ns: int) -> list[CalibrationFault]:
+        """The fault of an offset that is not corrected, where it has begun, changed or ended since the last call."""
+        mean_s, before_s = self.estimate[0], self._reported_s
+        active = self._far(self.applied_s) >= 0.5 and abs(mean_s - self.applied_s) > FAR_S
+        if before_s is None and not active:
+            return []
+        if before_s is not None and active and abs(mean_s - before_s) < REPORT_EVERY_S:
+            return []
+        if before_s is not None and not active and self._far(self.applied_s) >= MIN_COMPONENT_WEIGHT:
+            return []  # not sure yet
+        self._reported_s = mean_s if active else None
+        now_s = mean_s if active else self.applied_s
+        detail = "images show roll, pitch and turns at another time than the autopilot reports them"
+        if not active:
+            detail = "it is subtracted from the time stamps" if now_s else "images and attitude agree in time"
+        return [CalibrationFault(t_ns=t_ns, quantity=QUANTITY, factor=now_s, detail=detail, active=active)]
+
+    # --- comparison ----------------------------------------------------------------------------------------------
+
+    @property
+    def _hazards(self) -> Hazards:
+        return BUFFERED if self.buffered else STAMPED
+
+    def _far(self, from_s: float) -> float:
+        """Probability of an offset that is not within FAR_S of ``from_s``."""
+        return float(self.density[np.abs(GRID_S - from_s) > FAR_S].sum())
+
+    def _sigma_about(self, from_s: float) -> float:
+        return float(np.sqrt(self.density @ (GRID_S - from_s) ** 2 + RESOLUTION_S2))
+
+    def _compare(self, view: _View, telemetry: Telemetry) -> None:
+        now = self._levelled(view, telemetry)
+        if now is None or view.keyframe_id not in self._chain:  # another fragment
+            self._chain, self._before, self._velocity = {}, None, None
+        if now is None:
             return
-        reported_rad = after[0] - before[0]
-        residual_rad = (turn.yaw_rad - reported_rad + np.pi) % (2.0 * np.pi) - np.pi
-        rolled = np.sin(after[2]) - np.sin(before[2])
-        decay = 1.0 - 1.0 / MEMORY_TURNS
-        self._residual2 = decay * self._residual2 + residual_rad**2
-        self._residual_roll = decay * self._residual_roll + residual_rad * rolled
-        self._roll2 = decay * self._roll2 + rolled**2
-        reported_rad = (reported_rad + np.pi) % (2.0 * np.pi) - np.pi  # each end is unwrapped by itself
-        self._turned2 = decay * self._turned2 + turn.yaw_rad**2 + reported_rad**2
-        self._count = decay * self._count + 1.0
+        if (keyframe := self._chain.get(view.keyframe_id)) is not None:
+            now = _Levelled(now.t_ns, keyframe.moved + now.moved, keyframe.turned_rad + now.turned_rad, now.tilt)
+        self._chain = {frame: one for frame, one in self._chain.items() if frame >= view.keyframe_id}
+        self._chain[view.frame_id] = now
+        before = self._before = self._before or now
+        if now.t_ns - before.t_ns < MIN_SPAN_NS:
+            return
+        self._before, slower, span_s = now, self._velocity, (now.t_ns - before.t_ns) * 1e-9
+        mount2 = MOUNT_SIGMA_RAD**2 * np.abs(now.tilt - before.tilt) ** 2
+        moved, middle_ns = (now.moved - before.moved) / span_s, (now.t_ns + before.t_ns) // 2
+        faster = self._velocity = _Velocity(middle_ns, span_s, moved, mount2 / span_s**2)
+        turned_rad = (now.turned_rad - before.turned_rad + np.pi) % (2.0 * np.pi) - np.pi
+        log = self._log_likelihood(0, turned_rad, mount2, MIN_TURN_SIGMA_RAD**2, 1)
+        if slower is not None:
+            jump, floor = _jump(slower, faster, view.agl_m, telemetry)
+            log = log + self._log_likelihood(1, jump, 0.5 * (faster.mount2 + slower.mount2), floor, 2)
+        since_s = 0.0 if self._at_ns is None else (view.t_ns - self._at_ns) * 1e-9
+        mass = predicted(self._mass, since_s, self._hazards) * np.exp(np.maximum(log - log.max(), -MAX_NATS))
+        self._mass, self._at_ns = mass / mass.sum(), view.t_ns
+
+    def _levelled(self, view: _View, telemetry: Telemetry) -> _Levelled | None:
+        """None where attitudes do not cover the grid."""
+        shift_ns = np.round(GRID_S * 1e9).astype(np.int64)
+        points, tilt = [], np.zeros(0)
+        for t_ns, xy in ((view.keyframe_ns, view.pairs[:, :2]), (view.t_ns, view.pairs[:, 2:])):
+            attitudes = telemetry.attitudes_about(t_ns - shift_ns)
+            if attitudes is None:
+                return None
+            r_w_b, tilt = attitudes
+            rays = r_w_b @ self._r_b_c @ np.column_stack([xy, np.ones(len(xy))]).T  # (L, 3, N)
+            points.append((rays[:, 0] + 1j * rays[:, 1]) / np.maximum(-rays[:, 2], MIN_DOWN))
+        keyframe, frame = points
+        from_mean, to_mean = frame - frame.mean(1, keepdims=True), keyframe - keyframe.mean(1, keepdims=True)
+        ratio = (from_mean.conj() * to_mean).sum(1) / np.maximum((np.abs(from_mean) ** 2).sum(1), 1e-12)
+        return _Levelled(view.t_ns, keyframe.mean(1) - ratio * frame.mean(1), np.angle(ratio), tilt)
+
+    def _log_likelihood(
+        self, kind: int, residual: np.ndarray, mount2: np.ndarray, floor: float, axes: int
+    ) -> np.ndarray:
+        """(L,) of the ``residual`` (L,) at each offset. ``mount2`` (L,): variance by the mount; ``floor``: least
+        variance of the noise.
+
+        The attitude is noisy itself. Where it varies over the grid no more than its noise does, it tells nothing: the
+        residual shrinks towards its mean over the grid (regression dilution)."""
+        noise, density = max(self._noise[kind], floor), self._mass.sum(axis=0)
+        mean = residual.mean()
+        gain = max(0.0, 1.0 - noise / max(float(np.mean(np.abs(residual - mean) ** 2)), 1e-12))
+        variance = max(gain, MIN_NOISE_SHARE) * noise + mount2
+        likely2 = float(density @ np.clip(np.abs(residual) ** 2 - mount2, 0.0, GATE[2] * self._noise[kind]))
+        self._noise[kind] += (likely2 - self._noise[kind]) / NOISE_MEMORY
+        shrunk2 = np.abs(mean + gain * (residual - mean)) ** 2
+        return np.asarray(-0.5 * INDEPENDENT_SHARE * axes * (shrunk2 / variance + np.log(variance)))
 
 
-def _normal(x: np.ndarray, sigma: float) -> np.ndarray:
-    """Density of N(0, sigma^2) at ``x``."""
-    return np.asarray(np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)))
+def _jump(before: _Velocity, now: _Velocity, agl_m: float, telemetry: Telemetry) -> tuple[np.ndarray, float]:
+    """-> (L,) complex, change of velocity that inertial readings do not explain [heights/s], over the root of two, and
+    its least variance on each axis."""
+    between_s = (now.middle_ns - before.middle_ns) * 1e-9
+    change_mps = telemetry.velocity_changes(before.middle_ns, now.middle_ns, GRID_S)
+    accel_mps2 = ACCELERATION_SIGMA_MPS2 if change_mps is None else INERTIAL_SIGMA_MPS2
+    inertial = 0.0 if change_mps is None else change_mps / agl_m
+    tilt = MIN_TILT_SIGMA_RAD * float(np.hypot(1.0 / now.span_s, 1.0 / before.span_s))
+    return (now.mean - before.mean - inertial) / np.sqrt(2.0), tilt**2 + (accel_mps2 * between_s / agl_m) ** 2

@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from terrafix.core.geodesy import yaw_of
 from terrafix.estimator.factors.three_view import ThreeViewConstraint, ThreeViewPose, three_view_constraint
 from terrafix.estimator.filter_state import FilterState, FrameInput
 from terrafix.estimator.integrity.fragments import Fragment, MotionEvidence
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture, ViewChange
-from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.ground_plane_motion import plane_motion
@@ -63,13 +61,11 @@ class GatedOdometry:
 
 
 class OdometryMeasurement:
-    """``gated`` of each frame, in order; then ``turn`` and ``three_view`` of the same."""
+    """``gated`` of each frame, in order; then ``three_view`` of the same."""
 
     def __init__(self, state: FilterState) -> None:
         self._state = state
         self._static_picture, self._view_change = StaticPicture(), ViewChange()
-        # Of the newest frame: time, keyframe, heading since that.
-        self._heading_seen: tuple[int, int, float] | None = None
 
     def gated(self, frame: FrameInput, before: NodeState, increment: Callable[[], MotionIncrement]) -> GatedOdometry:
         """``before``: the newest node; ``increment()``: of the motion model, from there to the frame."""
@@ -169,25 +165,6 @@ class OdometryMeasurement:
         inertial = innovation.inertial and self._state.continuity.inertial_since_fused
         evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree, inertial)
         fragment.add_frame(frame.t_s, evidence, only_by_place=self._state.images_contradicted)
-
-    def turn(self, gated: GatedOdometry) -> Turn | None:
-        """Change of heading since the frame before, when both were seen from one keyframe, or that frame is the
-        keyframe."""
-        before, self._heading_seen = self._heading_seen, None
-        if gated.motion is None:
-            return None
-        state, parent, odometry = self._state, gated.motion.parent, gated.motion.odometry
-        node = state.graph.state(parent)
-        r_w_kf = node.pose.rotation().matrix()
-        rotations = (r_w_kf, r_w_kf @ gated.motion.motion.r)
-        yaw_kf_rad, yaw_rad = (yaw_of(state.camera.body(r_w_c, node.calibration)) for r_w_c in rotations)
-        since_rad = yaw_rad - yaw_kf_rad
-        self._heading_seen = (odometry.t_ns, odometry.keyframe_id, since_rad)
-        if before is not None and before[1] == odometry.keyframe_id:
-            return Turn(before[0], odometry.t_ns, math.remainder(since_rad - before[2], math.tau))
-        if before is not None and parent == state.graph.newest:
-            return Turn(before[0], odometry.t_ns, math.remainder(since_rad, math.tau))
-        return None
 
     def three_view(self, seen: KeyframeMotion) -> tuple[int, ThreeViewConstraint] | None:
         """The constraint of points that the keyframe before, the keyframe and the frame saw, and the node of the

@@ -138,6 +138,28 @@ class Telemetry:
         at_ns = t_ns[:, None] + about_ns
         return np.stack([np.interp(at_ns, turns[0], angle).mean(axis=1) for angle in _unwrapped(turns[1])])
 
+    def attitudes_about(self, t_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """-> R_w_b (N, 3, 3) about times (N,) [ns], as ``turned_about``, and sines of roll and pitch (N,), as complex
+        numbers."""
+        angles = self.turned_about(t_ns)
+        if angles is None:
+            return None
+        r_w_b = np.stack([rotate_to_world([*axis], *angles) for axis in np.eye(3)], axis=2)
+        return r_w_b, np.sin(angles[2]) + 1j * np.sin(angles[1])
+
+    def velocity_changes(self, t0_ns: int, t1_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
+        """(N,) complex, east + j north [m/s]: change of velocity from ``t0_ns`` to ``t1_ns``, both less each of
+        ``offset_s`` (N,). None when readings or attitudes do not cover that."""
+        first_ns, last_ns = t0_ns - round(offset_s.max() * 1e9), t1_ns - round(offset_s.min() * 1e9)
+        world = self.world_acceleration(first_ns, last_ns)
+        if world is None:
+            return None
+        accel_mps2 = world.accel_w_mps2[:, 0] + 1j * world.accel_w_mps2[:, 1]
+        mps = np.concatenate([[0.0], np.cumsum(0.5 * (accel_mps2[1:] + accel_mps2[:-1]) * np.diff(world.s_s))])
+        ends = (np.interp((t_ns - first_ns) * 1e-9 - offset_s, world.s_s, mps) for t_ns in (t0_ns, t1_ns))
+        before, after = ends
+        return np.asarray(after - before)
+
     def turn_without_gyro(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
         """-> rotation (3,) about east, north and up [rad] by which the attitude turned from ``t0_ns`` to ``t1_ns`` and
         the gyroscopes did not, and the angle by which these turned. None when readings or attitudes do not cover

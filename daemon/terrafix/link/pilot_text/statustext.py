@@ -13,6 +13,13 @@ def fault_text(fault: CalibrationFault) -> str:
     """Text of 40 characters at most about a fault that a monitor found or ended."""
     if fault.quantity == "registration":
         return "the map is found nowhere: no fix" if fault.active else "the map is found again"
+    if fault.quantity == "start":
+        return "take-off moved: no fix before the map" if fault.active else "the map has placed the start"
+    if fault.quantity == "camera time" and fault.factor is not None:
+        if not fault.active:
+            return f"camera {fault.factor:.1f} s late: corrected" if fault.factor else "camera time is right again"
+        late, which = abs(fault.factor), "camera" if fault.factor > 0.0 else "telemetry"
+        return f"{which} {late:.1f} s late: check its buffers"
     if fault.quantity.startswith("picture"):
         turned = "" if fault.factor is None else f" by {fault.factor:.0f} deg"
         return f"{fault.quantity}{turned}: not used" if fault.active else "the picture is right again"

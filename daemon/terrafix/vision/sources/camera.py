@@ -124,11 +124,11 @@ class LiveCamera:
                         logs.get().warning("camera lost; reconnecting", source=self.spec)
                     continue
                 arrival_ns = now_ns()
-                t_ns = _timestamp_ns(capture, arrival_ns)
+                t_ns, buffered = _timestamp_ns(capture, arrival_ns)
                 if self._is_late(arrival_ns - t_ns) or t_ns < due_ns:
                     continue
                 due_ns = max(due_ns + self._period_ns, t_ns + self._period_ns // 2)  # keeps the mean rate, no bursts
-                yield self._shot(capture, frame_id, t_ns)
+                yield self._shot(capture, frame_id, t_ns, buffered=buffered)
                 frame_id += 1
         finally:
             self._streaming = False
@@ -150,13 +150,21 @@ class LiveCamera:
                 logs.get().info("images in time again", source=self.spec)
         return late
 
-    def _shot(self, capture: Capture, frame_id: int, t_ns: int) -> Shot:
+    def _shot(self, capture: Capture, frame_id: int, t_ns: int, *, buffered: bool) -> Shot:
         camera = self._origin.camera
         decoded, image = capture.retrieve()
         error = "" if decoded else "cannot be decoded"
         if decoded and image.shape != (camera.height, camera.width, 3):
             error = f"wrong size: {image.shape[1]}x{image.shape[0]}, the camera says {camera.width}x{camera.height}"
-        frame = Frame(t_ns=t_ns, frame_id=frame_id, file="", width=camera.width, height=camera.height, error=error)
+        frame = Frame(
+            t_ns=t_ns,
+            frame_id=frame_id,
+            file="",
+            width=camera.width,
+            height=camera.height,
+            error=error,
+            buffered=buffered,
+        )
         return Shot(frame, (), None if error else image)
 
     def _ensure_connected(self) -> Capture | None:
@@ -205,13 +213,14 @@ def is_stream_url(spec: str) -> bool:
     return spec.startswith(("http://", "https://")) and "!" not in spec
 
 
-def _timestamp_ns(capture: Capture, arrival_ns: int) -> int:
-    """Timestamp of the grabbed frame. V4L2 uses the monotonic clock (V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC) and OpenCV
-    returns it as POS_MSEC."""
+def _timestamp_ns(capture: Capture, arrival_ns: int) -> tuple[int, bool]:
+    """-> timestamp of the grabbed frame, and whether a buffer may lie between the exposure and it. V4L2 uses the
+    monotonic clock (V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC) and OpenCV returns it as POS_MSEC."""
     if isinstance(capture, MjpegCapture):
-        return capture.stamp_ns or arrival_ns
+        return capture.stamp_ns or arrival_ns, True
     driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-    return driver_ns if 0 <= arrival_ns - driver_ns <= MAX_DRIVER_AGE_NS else arrival_ns
+    stamped = 0 <= arrival_ns - driver_ns <= MAX_DRIVER_AGE_NS
+    return (driver_ns, False) if stamped else (arrival_ns, True)
 
 
 def _shut_down(connection: socket.socket) -> None:

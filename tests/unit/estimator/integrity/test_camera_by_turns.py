@@ -12,7 +12,7 @@ from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight, some_features
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b, yaw_of
 from terrafix.estimator.integrity.camera_vehicle import CameraVehicleTest
-from terrafix.estimator.integrity.time_offset import Turn
+from terrafix.estimator.integrity.turn_comparison import Turn
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.monitors.visual_motion import image_turn
 from terrafix.estimator.prior import CheckpointWriter, load_checkpoint

@@ -1,111 +1,116 @@
-"""Time offset between frames and telemetry, from turns that both observe."""
-
-import math
+"""Time offset between frames and telemetry, from the attitude that both observe."""
 
 import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, t_ns
-from terrafix.core.geodesy import yaw_of
-from terrafix.estimator.integrity.time_offset import GRID_S, MAX_SLEW, PRIOR_SIGMA_S, TimeOffset, Turn
+from inertial_flight import ORIGIN as INERTIAL_ORIGIN
+from inertial_flight import InertialFlight
+from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of, t_ns
+from terrafix.core.camera import Mount
+from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, Hazards, predicted
+from terrafix.estimator.integrity.time_offset import MAX_SLEW, PRIOR_SIGMA_S, TimeOffset
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.pose_estimator import EstimatedFlight
-from terrafix.messages import Odometry, Prediction, VehicleState
+from terrafix.messages import CalibrationFault, Frame, Imu, NavEstimate, Odometry, Prediction, VehicleState
 
-FRAME_S, TELEMETRY_S = 0.5, 0.1
-
-
-def heading_rad(t_s: np.ndarray, turns: bool) -> np.ndarray:
-    """A course with turns of 30 degrees/s for two seconds, every nine; or none."""
-    return np.asarray(math.radians(30.0) * (2.0 * (t_s // 9.0) + np.clip(t_s % 9.0, 0.0, 2.0)) * turns)
+R_B_C = Mount.of(CAMERA).r_b_c()
 
 
-SECONDS = 60.0
+def grown(t_s: float) -> float:
+    """A buffer that fills from 20 s on: a second in 20."""
+    return float(np.clip((t_s - 20.0) / 20.0, 0.0, 1.2))
 
 
-def attitude(t_s: float, yaw_rad: float) -> VehicleState:
-    yaw_rad = math.remainder(yaw_rad, math.tau)
-    return VehicleState(t_ns=round(t_s * 1e9), source="test", yaw_rad=yaw_rad, pitch_rad=0.0, roll_rad=0.0)
+@pytest.fixture(scope="module")
+def plane() -> InertialFlight:
+    return InertialFlight(2, 75, 25, delay=grown)
 
 
-def flown(
-    late_s: float, *, turns: bool = True, noise_deg: float = 0.3, seed: int = 1, every_s: float = FRAME_S
-) -> TimeOffset:
-    """Frames with time stamps ``late_s`` after the exposure."""
-    rng = np.random.default_rng(seed)
-    telemetry, offset = Telemetry(), TimeOffset()
-    reported_s, frame_s = np.arange(0.0, SECONDS, TELEMETRY_S), np.arange(3.0, SECONDS, every_s)
-    yaw = heading_rad(reported_s, turns) + np.radians(noise_deg) * rng.normal(size=len(reported_s))
-    seen = np.unwrap(heading_rad(frame_s - late_s, turns)) + np.radians(0.1) * rng.normal(size=len(frame_s))
-    at = 0
-    for i, t_s in enumerate(frame_s):
-        while at < len(reported_s) and reported_s[at] <= t_s:
-            telemetry.add(attitude(float(reported_s[at]), float(yaw[at])))
-            at += 1
-        if i:
-            turn_rad = math.remainder(float(seen[i] - seen[i - 1]), math.tau)
-            offset.add(Turn(round(frame_s[i - 1] * 1e9), round(t_s * 1e9), turn_rad), telemetry)
-        offset.step(every_s)
+def offset_of(flight: InertialFlight, until_s: float = 1e9) -> TimeOffset:
+    telemetry, offset = Telemetry(), TimeOffset(R_B_C)
+    offset.buffered = True
+    for messages in flight.messages_by_frame:
+        for message in messages:
+            if message.t_ns > until_s * 1e9:
+                return offset
+            if isinstance(message, VehicleState):
+                telemetry.add(message)
+            elif isinstance(message, Imu):
+                telemetry.add_imu(message)
+            elif isinstance(message, Odometry):
+                offset.add(message, telemetry, 120.0)
+                offset.step(0.5)
     return offset
 
 
-@pytest.mark.parametrize("late_s", [1.0, 0.4, -0.5])
-@pytest.mark.parametrize("noise_deg", [0.3, 2.0])
-def test_a_time_offset_is_estimated_and_applied(late_s: float, noise_deg: float) -> None:
-    offset = flown(late_s, noise_deg=noise_deg)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_camera_in_time_is_not_corrected_and_not_claimed_wider(seed: int) -> None:
+    offset = offset_of(InertialFlight(seed, 60, 25))
+    assert offset.applied_s == 0.0 and offset.sigma_s <= PRIOR_SIGMA_S
+
+
+def test_an_offset_that_grows_is_followed(plane: InertialFlight) -> None:
+    offset = offset_of(plane)
     mean_s, sigma_s = offset.estimate
-    assert mean_s == pytest.approx(late_s, abs=max(3.0 * sigma_s, 0.06))
-    assert offset.applied_s == pytest.approx(late_s, abs=0.1)
+    assert mean_s == pytest.approx(1.2, abs=max(3.0 * sigma_s, 0.06))
+    assert offset.applied_s > 0.3 and abs(1.2 - offset.applied_s) < 3.0 * offset.sigma_s
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_an_insignificant_time_offset_is_not_applied(seed: int) -> None:
-    offset = flown(0.02, seed=seed)
-    assert offset.applied_s == 0.0 and abs(offset.estimate[0]) < 3.0 * PRIOR_SIGMA_S
-
-
-def test_a_straight_flight_gives_no_time_offset() -> None:
-    offset = flown(1.0, turns=False)
-    assert offset.applied_s == 0.0 and offset.sigma_s == pytest.approx(PRIOR_SIGMA_S)
-
-
-def test_compass_noise_without_turns_gives_no_time_offset() -> None:
-    assert flown(0.0, turns=False, noise_deg=5.0).applied_s == 0.0
-
-
-def test_the_slew_rate_of_the_applied_offset_is_limited() -> None:
-    offset = flown(1.0)
-    before_s = offset.applied_s
-    offset._residual2, offset._count = np.zeros_like(offset._residual2), 0.0  # clears the evidence
-    offset.step(FRAME_S)
-    assert offset.applied_s == pytest.approx(before_s - MAX_SLEW * FRAME_S)
-
-
-def test_pending_turns_are_dropped_if_no_heading_is_reported() -> None:
-    telemetry, offset = Telemetry(), TimeOffset()
-    for i in range(1000):
-        offset.add(Turn(i * 10**9, (i + 1) * 10**9, 0.5), telemetry)
+def test_without_attitudes_nothing_is_compared_and_views_do_not_pile_up() -> None:
+    telemetry, offset = Telemetry(), TimeOffset(R_B_C)
+    view = {"keyframe_id": 0, "verdict": "accepted", "two_view": [(0.1, 0.1, 0.1, 0.1)] * 8}
+    for i in range(100):
+        offset.add(
+            msgspec.convert({"t_ns": i * 10**9, "frame_id": i, **view, "type": "Odometry"}, Odometry), telemetry, 100.0
+        )
     assert offset.applied_s == 0.0 and len(offset._pending) < 6
 
 
-def test_a_time_offset_is_estimated_at_60_frames_per_second() -> None:
-    assert flown(1.0, every_s=1.0 / 60.0).applied_s == pytest.approx(1.0, abs=0.1)
+def test_an_offset_that_nothing_observes_is_claimed_once_its_buffer_may_have_filled() -> None:
+    """Of an hour in which a buffer begins to fill once, 5 % are three minutes."""
+    mass = np.zeros((len(RATES), len(GRID_S)))
+    mass[0, 40] = 1.0
+    hourly = Hazards(1.0 / 3600.0, 0.0)
+    away = [1.0 - predicted(mass, 1.0, hourly)[:, 40].sum()]
+    for _ in range(299):
+        mass = predicted(mass, 1.0, hourly)
+        away.append(1.0 - mass[:, 39:42].sum())
+    assert mass.sum() == pytest.approx(1.0) and away[60] < 0.05 < away[299]
+
+
+def test_a_buffer_that_fills_is_told_claimed_and_corrected(plane: InertialFlight) -> None:
+    """Before: 51 of 150 frames beyond 20 m and three times their claim."""
+    run, beyond = EstimatorRun(), 0
+    run.feed([INERTIAL_ORIGIN, Frame(t_ns=0, frame_id=0, file="", width=1, height=1, buffered=True)])
+    for i, messages in enumerate(plane.messages_by_frame):
+        estimates = [m for m in run.feed(messages) if isinstance(m, NavEstimate)]
+        if not estimates:
+            continue
+        estimate, stamp_s = estimates[-1], 0.5 * i
+        at_m = np.array(PLACE.to_local(estimate.lat_deg, estimate.lon_deg))
+        at_m = at_m + np.array(estimate.velocity_enu_mps[:2]) * (stamp_s - estimate.t_ns * 1e-9)
+        error_m = float(np.hypot(*(at_m - plane.true_m[i][:2])))
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_of(estimate)[:2, :2])[-1]))
+        beyond += i > 10 and error_m > max(20.0, 3.0 * sigma_m)
+    faults = [m for m in run.published if isinstance(m, CalibrationFault) and m.quantity == "camera time"]
+    assert beyond == 0
+    assert faults and faults[0].active and faults[0].factor is not None and faults[0].factor > 0.0
 
 
 class LateCamera(TimeOffset):
-    """Estimates an offset of a second with certainty, and stores the added turns."""
+    """Estimates an offset of a second with certainty, and stores the stamps of the added frames."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self.turns: list[Turn] = []
+        super().__init__(R_B_C)
+        self.stamps_ns: list[int] = []
 
     @property
-    def estimate(self) -> tuple[float, float]:
-        return 1.0, 0.01
+    def density(self) -> np.ndarray:
+        return np.where(np.abs(GRID_S - 1.0) < 0.01, 1.0, 0.0)
 
-    def add(self, turn: Turn, telemetry: Telemetry) -> None:
-        self.turns.append(turn)
+    def add(self, odometry: Odometry, telemetry: Telemetry, agl_m: float) -> None:
+        self.stamps_ns.append(odometry.t_ns)
 
 
 def flight_of(run: EstimatorRun) -> EstimatedFlight:
@@ -114,53 +119,36 @@ def flight_of(run: EstimatorRun) -> EstimatedFlight:
     return flight
 
 
-def test_the_node_shifts_frame_times_by_the_slew_limited_offset_and_adds_turns_at_the_stamps() -> None:
+def test_the_node_shifts_frame_times_by_the_slew_limited_offset_and_compares_at_the_stamps() -> None:
     flight, late = Flight(30, seed=3), LateCamera()
     listener = EstimatorRun().fly(flight, 0, 10)
     flight_of(listener).time_offset = late
     listener.fly(flight, 10, 30)
     shifted_s = [(t_ns(i) - listener.estimate(i).t_ns) * 1e-9 for i in range(10, 30)]
     assert shifted_s == pytest.approx([min(MAX_SLEW * 0.5 * (i + 1), 1.0) for i in range(20)])
-    assert [(turn.t0_ns, turn.t1_ns) for turn in late.turns] == [(t_ns(i - 1), t_ns(i)) for i in range(10, 30)]
-
-
-def test_the_node_adds_the_turns_of_the_camera_except_beside_untracked_frames() -> None:
-    """Between and within keyframes, across north; none beside a frame without tracking."""
-    flight, late, dark = Flight(50, seed=3, turn_rad=-4.0), LateCamera(), 25
-    listener = EstimatorRun().fly(flight, 0, 10)
-    flight_of(listener).time_offset = late
-    for i in range(10, 50):
-        listener.feed([blind(m) if isinstance(m, Odometry) and i == dark else m for m in flight.messages(i)])
-    heading_rad = {t_ns(i): yaw_of(r) for i, r in enumerate(flight.r_w_b)}
-    off_rad = [
-        math.remainder(turn.yaw_rad - heading_rad[turn.t1_ns] + heading_rad[turn.t0_ns], math.tau)
-        for turn in late.turns
-    ]
-    assert np.abs(off_rad).max() < 0.05
-    assert max(abs(turn.yaw_rad) for turn in late.turns) > 0.9
-    assert {turn.t1_ns for turn in late.turns} == {t_ns(i) for i in range(10, 50) if i not in (dark, dark + 1)}
+    assert late.stamps_ns == [t_ns(i) for i in range(10, 30)]
 
 
 class KnownTo(TimeOffset):
-    """An offset of zero with ``one_sigma_s``; ``unstamped``: probability of a camera that does not stamp its frames."""
+    """An offset of zero with ``one_sigma_s``, of a share of all cameras; the others have none."""
 
-    def __init__(self, one_sigma_s: float, unstamped: float) -> None:
-        super().__init__()
-        self._known = one_sigma_s, unstamped
+    def __init__(self, one_sigma_s: float, share: float) -> None:
+        super().__init__(R_B_C)
+        self._known = one_sigma_s, share
 
     @property
-    def density(self) -> tuple[np.ndarray, float]:
-        one_sigma_s, unstamped = self._known
-        density = np.exp(-0.5 * (GRID_S / one_sigma_s) ** 2)
-        return density / density.sum(), unstamped
+    def density(self) -> np.ndarray:
+        one_sigma_s, share = self._known
+        wide = np.exp(-0.5 * (GRID_S / one_sigma_s) ** 2)
+        return share * wide / wide.sum() + (1.0 - share) * (np.abs(GRID_S) < 0.01)
 
 
-@pytest.mark.parametrize(("unstamped", "sigma_s"), [(0.01, PRIOR_SIGMA_S), (0.2, 0.3)])
+@pytest.mark.parametrize(("share", "sigma_s"), [(0.01, PRIOR_SIGMA_S), (1.0, 0.3)])
 def test_the_uncertainty_of_the_time_offset_inflates_the_covariance_along_the_velocity(
-    unstamped: float, sigma_s: float
+    share: float, sigma_s: float
 ) -> None:
     flight, covs_m2 = Flight(12, seed=3), []
-    for offset in (KnownTo(0.3, unstamped), KnownTo(0.03, 0.0)):
+    for offset in (KnownTo(0.3, share), KnownTo(0.03, 0.0)):
         listener = EstimatorRun().fly(flight, 0, 11)
         flight_of(listener).time_offset = offset
         covs_m2.append(cov_of(listener.fly(flight, 11, 12).estimate(11))[:2, :2])
@@ -184,23 +172,3 @@ def test_a_new_origin_resets_the_time_offset() -> None:
     assert listener.estimate(11).t_ns == t_ns(11)
     first = [m for m in listener.published if isinstance(m, Prediction) and m.frame_id == 10][-1]
     assert np.hypot(*first.step_m) < 1e-9
-
-
-def test_a_mount_pitch_error_is_not_taken_for_a_time_offset() -> None:
-    """A mount pitch error of 4 degrees changes the visual turn of a plane by -2.3 degrees when it rolls into a turn,
-    and by +2.3 degrees when it rolls out."""
-
-    rng, telemetry, offset = np.random.default_rng(5), Telemetry(), TimeOffset()
-    t_s = np.arange(0.0, 120.0, TELEMETRY_S)
-    rate = np.interp(t_s % 12.0, [0.0, 1.0, 5.0, 6.0], [0.0, math.radians(12.0), math.radians(12.0), 0.0])
-    yaw, roll = np.cumsum(rate) * TELEMETRY_S, np.arctan(22.0 * rate / 9.81)
-    noise = np.radians(0.3) * rng.normal(size=len(t_s))
-    for at, reported, rolled in zip(t_s, yaw + noise, roll, strict=True):
-        state = attitude(float(at), float(reported))
-        telemetry.add(msgspec.structs.replace(state, roll_rad=float(rolled)))
-        if round(at * 10) % 10 == 5 and at > 1.0:
-            i, j = round((at - 1.0) * 10), round(at * 10)
-            seen = yaw[j] - yaw[i] - math.radians(4.0) * (math.sin(roll[j]) - math.sin(roll[i]))
-            offset.add(Turn(round((at - 1.0) * 1e9), round(at * 1e9), float(seen)), telemetry)
-            offset.step(1.0)
-    assert offset.applied_s == 0.0 and offset.sigma_s < 0.1

@@ -1,0 +1,45 @@
+"""How a time offset changes: probability mass (R, L) over rates and offsets, moved on in time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+STEP_S = 0.05  # s: of the grid of offsets [tuned]
+# s: two seconds early (late telemetry), three late: what the camera source lets pass [spec: vision/sources/camera.py]
+GRID_S = np.arange(-2.0, 3.0001, STEP_S)
+RESOLUTION_S2 = STEP_S**2 / 12.0  # s^2 [spec: variance of a uniform density over a grid cell]
+# s/s at which an offset may drift; 0 first. A buffer fills by what a receiver is slower: 2 to 40 %, and empties again.
+RATES = np.array([0.0, -0.4, -0.1, 0.02, 0.05, 0.1, 0.2, 0.4])  # [spec: the last one fills the grid in 8 s]
+STOP_HZ = 1.0 / 20.0  # a drift ends after 20 s in the mean: a buffer is full [spec: half of 2 s in 40 s]
+
+
+@dataclass(frozen=True)
+class Hazards:
+    """Per second: that a constant offset begins to drift, that it jumps to any other."""
+
+    drift_hz: float
+    jump_hz: float
+
+
+def predicted(mass: np.ndarray, dt_s: float, hazards: Hazards) -> np.ndarray:
+    """``mass`` (R, L) after ``dt_s``."""
+    if dt_s <= 0.0:
+        return mass
+    moved = [_shifted(row, rate * dt_s / STEP_S) for row, rate in zip(mass, RATES, strict=True)]
+    constant, drifting = moved[0], np.array(moved[1:])
+    drift, jump, stop = (1.0 - float(np.exp(-rate * dt_s)) for rate in (hazards.drift_hz, hazards.jump_hz, STOP_HZ))
+    any_other = jump * float(constant.sum()) / len(GRID_S)
+    stays = (1.0 - drift - jump) * constant + stop * drifting.sum(axis=0) + any_other
+    return np.vstack([stays, (1.0 - stop) * drifting + drift * constant / len(drifting)])
+
+
+def _shifted(row: np.ndarray, cells: float) -> np.ndarray:
+    """``row`` (L,) moved by ``cells``; what leaves the grid stays at its end."""
+    if cells == 0.0 or not row.any():
+        return row
+    whole = int(np.floor(cells))
+    to, share = np.arange(len(row)) + whole, cells - whole
+    moved = np.zeros_like(row)
+    np.add.at(moved, np.clip(to, 0, len(row) - 1), (1.0 - share) * row)
+    np.add.at(moved, np.clip(to + 1, 0, len(row) - 1), share * row)
+    return moved
