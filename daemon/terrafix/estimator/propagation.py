@@ -416,6 +416,8 @@ class Propagation:
 
     def _note_refused_motion(self, odometry: GatedOdometry, t_s: float) -> None:
         innovation = odometry.motion_innovation
+        if odometry.verdict is Verdict.UNCONFIRMED:  # two frames close together allow what a longer time does not
+            return
         if odometry.verdict is not Verdict.IMPLAUSIBLE:
             self._motion_refused = None
         elif self._motion_refused is None:
@@ -428,7 +430,7 @@ class Propagation:
         mirrored images explain them."""
         refused = self._motion_refused
         return (
-            refused is not None and t_s - refused.since_s >= MOTION_TIMEOUT_S and not self._state.orientation.suspects
+            refused is not None and t_s - refused.since_s >= MOTION_TIMEOUT_S and self._state.orientation.fault is None
         )
 
     # --- dead reckoning of the autopilot ---------------------------------------------------------------------------

@@ -186,17 +186,17 @@ def test_a_picture_that_turns_from_one_frame_to_the_next_is_no_turn_of_the_vehic
     assert [(m.quantity, m.active) for m in faults] == [(orientation.quantity, True)]
 
 
-def four_times_as_fast(odometry: Odometry, _: np.random.Generator) -> Odometry:
-    """Every motion since the keyframe: images of another flight, which no orientation explains."""
+def twice_as_fast(odometry: Odometry, _: np.random.Generator) -> Odometry:
+    """Every motion since the keyframe is doubled: images of another flight, which no orientation explains."""
     pairs = np.array(odometry.two_view)
-    pairs[:, 2:] += 3.0 * (pairs[:, 2:] - pairs[:, :2]).mean(axis=0)
+    pairs[:, 2:] += (pairs[:, 2:] - pairs[:, :2]).mean(axis=0)
     return with_pairs(odometry, pairs)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_images_that_contradict_inertial_readings_for_long_are_not_believed_for_that(seed: int) -> None:
     """The graph is reset, as wide as all of that time allows, and only a place ties images to it again."""
-    result = flown(seed, four_times_as_fast, lambda _: None)
+    result = flown(seed, twice_as_fast, lambda _: None)
     assert not result.lies()
     resets = [v for v in result.resets() if v.detail == "odometry contradicts inertial readings for 5 s"]
     assert len(resets) == 1
