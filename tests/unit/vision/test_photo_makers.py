@@ -172,6 +172,27 @@ def test_a_few_photos_of_another_lens_are_left_out_with_a_word(tmp_path: Path) -
     assert errors[0].startswith("another lens: 00.jpg") and not any(errors[1:])
 
 
+def test_zoomed_photos_whose_focal_length_is_not_clear_are_not_flown_as_the_others(tmp_path: Path) -> None:
+    for i in range(20):
+        photo(tmp_path / f"{i:02}.jpg", at_s=i, focal_35=24, zoom=2.0 if i == 7 else 1.0)
+    errors = [shot.frame.error for shot in open_source(str(tmp_path)).shots()]
+    assert errors[7].startswith("a lens that is not clear: has a digital zoom of 2") and not any(
+        errors[:7] + errors[8:]
+    )
+    for i in range(5):
+        photo(tmp_path / f"{i:02}.jpg", at_s=i, focal_35=24, zoom=2.0)
+    with pytest.raises(SourceError, match=r"00.jpg and 5 more has a digital zoom of 2.*the other photos do not"):
+        open_source(str(tmp_path))
+
+
+def test_photos_that_were_all_cut_are_flown_with_a_described_camera(tmp_path: Path) -> None:
+    for i in range(3):
+        photo(tmp_path / f"{i}.jpg", dji(**CALIBRATED), at_s=i, size=(240, 240), exif_size=(320, 240))
+    (tmp_path / "flight.toml").write_text("[camera]\nwidth=240\nheight=240\nfx=280\nfy=280\ncx=120\ncy=120\n")
+    source = open_source(str(tmp_path))
+    assert source.origin().camera.fx == 280.0 and not any(shot.frame.error for shot in source.shots())
+
+
 def angles(path: Path) -> tuple[float, float, float] | None:
     """Yaw, pitch and roll of the virtual vehicle in degrees."""
     info = read_info(path)

@@ -74,8 +74,9 @@ class Table:
         return all(name in self.columns for name in names)
 
     def column(self, name: str, missing: float = np.nan) -> np.ndarray:
-        """The numbers of a column; ``missing`` where the log has no such column."""
-        return self.columns[name] if name in self.columns else np.full(len(self), missing)
+        """The numbers of a column; ``missing`` where the log has no such column, or texts in it (a damaged FMT)."""
+        known = name in self.columns and self.columns[name].dtype != object
+        return self.columns[name] if known else np.full(len(self), missing)
 
     def texts(self, name: str) -> list[str]:
         """The texts of a column; empty ones where the log has no such column."""
@@ -91,7 +92,7 @@ class Table:
 
     def by_instance(self, *names: str) -> dict[int, "Table"]:
         """The messages of each instance (core, receiver), by the first column of ``names`` that there is; 0: none."""
-        key = next((name for name in names if name in self.columns), None)
+        key = next((name for name in names if name in self.columns and self.columns[name].dtype != object), None)
         if key is None:
             return {0: self} if len(self) else {}
         return {int(i): self.of(self.columns[key] == i) for i in np.unique(self.columns[key]) if np.isfinite(i)}
@@ -284,6 +285,7 @@ def _tables(parts: dict[str, tuple[Format, dict[str, np.ndarray], np.ndarray]]) 
 
 def _times(name: str, columns: dict[str, np.ndarray]) -> np.ndarray | None:
     """Seconds since the start of the autopilot; None: the message has no time."""
+    columns = {column: values for column, values in columns.items() if values.dtype != object}
     if "TimeUS" in columns:
         return columns["TimeUS"] * 1e-6
     if name in ("GPS", "GPS2"):  # in old logs TimeMS of a GPS is that of the GPS week, in those of 2013 Time, too

@@ -23,7 +23,15 @@ from terrafix.core.state_folder import flush_to_disk
 from terrafix.messages import VehicleState
 from terrafix.vision.sources.exif import PhotoInfo, read_info
 from terrafix.vision.sources.images import stated_size
-from terrafix.vision.sources.photos import EXIF_STEP_S, UNTIMED_STEP_S, in_time_order, reported, state_of
+from terrafix.vision.sources.photos import (
+    EXIF_STEP_S,
+    UNTIMED_STEP_S,
+    check_lenses,
+    in_time_order,
+    lens_groups,
+    reported,
+    state_of,
+)
 from terrafix.vision.sources.table import Row, read_table
 from terrafix_tools.console.payloads import MAX_IMAGE_PX, MIN_IMAGE_PX, Accepted, NewFlight
 from terrafix_tools.console.problems import FULL, Refusal
@@ -221,6 +229,11 @@ def store_batch(database: Database, flight_id: str, folder: Path, parts: list[Pa
     table = next((part for part in parts if part.field == TELEMETRY), None)
     rows = None if table is None else _telemetry(table, names)
     infos = reported([read_info(part.path) for part in images])
+    named = [(Path(part.name), info) for part, info in zip(images, infos, strict=True) if info is not None]
+    try:
+        check_lenses("the batch", lens_groups(named))
+    except SourceError as error:
+        raise Refusal(422, str(error)) from None
     try:
         for part in images:
             flush_to_disk(part.path)

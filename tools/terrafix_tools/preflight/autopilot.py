@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
+from terrafix.core.mavlink.vehicles import ARDUPILOT_TYPES
 from terrafix.link.mavlink.bandwidth import LinkBandwidth
 from terrafix.link.mavlink.diagnosis import ReceivedTraffic, no_autopilot_reason
 from terrafix.link.mavlink.framing import Framer
@@ -28,7 +29,6 @@ ANSWER_S = 2.0
 TRIPS = 10
 RATES_S = 6.5  # two windows of Streams: in the first one the streams start
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
-PLANES = {mavlink.MAV_TYPE_FIXED_WING, *range(19, 26)}  # 19 to 25 are VTOLs, which run ArduPlane
 
 
 class Autopilot:
@@ -87,7 +87,7 @@ class Autopilot:
                 "preflight supports only ArduPilot's parameters, docs/autopilot.md says what other firmware takes"
             )
         beat = self.newest["HEARTBEAT", self.sysid]
-        self.plane = beat.type in PLANES
+        self.plane = beat.type in ARDUPILOT_TYPES["ArduPlane"]
         self.armed = bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 
     def read(self, names: list[str]) -> dict[str, float]:

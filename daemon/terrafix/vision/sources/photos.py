@@ -46,7 +46,8 @@ class Photos:
             raise SourceError(f"{folder}: none of the {len(paths)} photos can be read")
         self._photos = in_time_order(list(zip(paths, infos, strict=True)))
         self._lenses = lens_groups([(path, info) for path, info, _ in self._photos if info is not None])
-        self._check_lenses()
+        check_lenses(str(folder), self._lenses)
+        self._unclear = self._unclear_lenses()
         self._description, self._where = self._describe(camera)
         main = {path for path, _ in self._lenses[0]} if self._lenses else None
         first = next(info for path, info, _ in self._photos if info is not None and (main is None or path in main))
@@ -101,6 +102,8 @@ class Photos:
             yield Fact("left out", f"{note} ({count} photos)")
         for group in self._lenses[1:]:
             yield Fact("left out", f"another lens: {lens_text(group)}")
+        for path, problem in self._unclear.items():
+            yield Fact("left out", f"{path.name}: {problem}")
         unreadable = [path.name for path, info, _ in self._photos if info is None]
         if unreadable:
             yield Fact("left out", f"{len(unreadable)} that cannot be read: {', '.join(unreadable[:MAX_NAMED])}")
@@ -116,6 +119,7 @@ class Photos:
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         camera, stored = self._origin.camera, self._stored
         other_lens = {path: f"another lens: {lens_text(group)}" for group in self._lenses[1:] for path, _ in group}
+        other_lens |= self._unclear
         for frame_id, (path, info, t_s) in enumerate(self._photos):
             if t_s < from_s:
                 continue
@@ -142,16 +146,20 @@ class Photos:
             description = _with_start(description, first.lat_deg, first.lon_deg)
         return origin_of(description, camera, start)
 
-    def _check_lenses(self) -> None:
-        """Raises SourceError when it is not clear which lens is meant. One camera describes a flight."""
-        others = sum(map(len, self._lenses[1:]))
-        if others > MAX_OTHER_LENS_SHARE * sum(map(len, self._lenses)):
-            groups = " and ".join(lens_text(group) for group in self._lenses[:2])
-            more = f" and {len(self._lenses) - 2} more" if len(self._lenses) > 2 else ""
+    def _unclear_lenses(self) -> dict[Path, str]:
+        """Photos whose focal length cannot be known beside others whose can, with the reason: they are left out. Raises
+        SourceError when they are too many. Where it is unclear in all photos, [camera] may state it."""
+        known = [(path, info.lens.problem) for path, info, _ in self._photos if info is not None]
+        unclear = {path: f"a lens that is not clear: {problem}" for path, problem in known if problem}
+        if len(unclear) == len(known):
+            return {}
+        if len(unclear) > MAX_OTHER_LENS_SHARE * len(known):
+            path, problem = next((path, problem) for path, problem in known if problem)
             raise SourceError(
-                f"{self.folder}: the photos are of several lenses or zooms: {groups}{more}; put those of one into a "
-                "folder of its own"
+                f"{self.folder}: {path.name} and {len(unclear) - 1} more {problem}, the other photos do not; put those "
+                "of one lens and zoom into a folder of its own"
             )
+        return unclear
 
     def _camera_from_exif(self, first: PhotoInfo) -> Camera:
         problem = next((i.lens.problem for _, i, _ in self._photos if i is not None and i.lens.problem), "")
@@ -246,6 +254,19 @@ def lens_groups(photos: list[tuple[Path, PhotoInfo]]) -> list[list[tuple[Path, P
         else:
             groups.append([photo])
     return sorted(groups, key=len, reverse=True)
+
+
+def check_lenses(where: str, groups: list[list[tuple[Path, PhotoInfo]]]) -> None:
+    """Raises SourceError when it is not clear which lens is meant: one camera describes a flight. ``where``: what has
+    the photos."""
+    others = sum(map(len, groups[1:]))
+    if others > MAX_OTHER_LENS_SHARE * sum(map(len, groups)):
+        named = " and ".join(lens_text(group) for group in groups[:2])
+        more = f" and {len(groups) - 2} more" if len(groups) > 2 else ""
+        raise SourceError(
+            f"{where}: the photos are of several lenses or zooms: {named}{more}; put those of one into a folder of "
+            "its own"
+        )
 
 
 def lens_text(group: list[tuple[Path, PhotoInfo]]) -> str:
