@@ -426,8 +426,8 @@ class Propagation:
             self._motion_refused = replace(self._motion_refused, inertial=False)
 
     def _is_motion_timed_out(self, t_s: float) -> bool:
-        """Whether impossible motions have gone on for so long that velocity may be what is wrong; not while a fault that
-        is named, turned or mirrored images, explains them."""
+        """Whether impossible motions have gone on for so long that velocity may be what is wrong; not while images that
+        are known to be turned or mirrored explain them."""
         refused = self._motion_refused
         return (
             refused is not None and t_s - refused.since_s >= MOTION_TIMEOUT_S and self._state.orientation.fault is None
