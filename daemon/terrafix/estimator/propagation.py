@@ -433,6 +433,8 @@ class Propagation:
 
     def _note_refused_motion(self, odometry: GatedOdometry, t_s: float) -> None:
         innovation = odometry.motion_innovation
+        if odometry.verdict is Verdict.UNCONFIRMED:  # two frames close together allow what a longer time does not
+            return
         if odometry.verdict is not Verdict.IMPLAUSIBLE:
             self._motion_refused = None
         elif self._motion_refused is None:
@@ -441,11 +443,11 @@ class Propagation:
             self._motion_refused = replace(self._motion_refused, inertial=False)
 
     def _is_motion_timed_out(self, t_s: float) -> bool:
-        """Whether impossible motions have gone on for so long that velocity may be what is wrong; not while turned or
-        mirrored images explain them."""
+        """Whether impossible motions have gone on for so long that velocity may be what is wrong; not while images that
+        are known to be turned or mirrored explain them."""
         refused = self._motion_refused
         return (
-            refused is not None and t_s - refused.since_s >= MOTION_TIMEOUT_S and not self._state.orientation.suspects
+            refused is not None and t_s - refused.since_s >= MOTION_TIMEOUT_S and self._state.orientation.fault is None
         )
 
     # --- dead reckoning of the autopilot ---------------------------------------------------------------------------

@@ -151,3 +151,13 @@ def test_fragment_and_displacement_are_stored_for_each_node() -> None:
     fragments.retain({8})
     with pytest.raises(KeyError):
         fragments.of(7)
+
+
+def test_images_that_contradicted_inertial_readings_are_confirmed_neither_by_motion_nor_by_duration() -> None:
+    fragment = Fragment(0.0)
+    evidence = MotionEvidence(np.zeros(2), 0.01 * np.eye(2), 1.0, inertial=True)
+    for i in range(1, 100):
+        fragment.add_frame(float(i), evidence, only_by_place=True)
+    assert not fragment.confirmed and not fragment.joined
+    fragment.join()
+    assert fragment.confirmed
