@@ -90,7 +90,7 @@ def ground(tmp_path_factory: pytest.TempPathFactory, wheels: Path, work: Path) -
 def test_the_aircrafts_environment_has_neither_gdal_nor_a_web_server_nor_the_lab(aircraft: Installed) -> None:
     names = ("rasterio", "fastapi", "dask", "terrafix_lab", "terrafix_tools.console")
     code = f"import importlib.util as u; print([n for n in {names} if u.find_spec(n)])"
-    done = subprocess.run([str(aircraft.python), "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([str(aircraft.python), "-I", "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
     refused = aircraft.run("map", "build", "nowhere.tif", "--out", "out/nowhere.gpkg")
     assert refused.returncode == 2 and "pip install 'terrafix[ground]'" in refused.stderr

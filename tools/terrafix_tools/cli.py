@@ -7,6 +7,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 # Modules that are not on a vehicle, by the extra that brings them: how their names begin.
 EXTRAS = {
     "console": (
-        "fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "python_multipart", "pydantic",
+        "fastapi", "starlette", "uvicorn", "sqlalchemy", "python_multipart", "pydantic",
         "terrafix_tools.console",
     ),
     "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "terrafix_"),
@@ -138,32 +139,28 @@ def run(
     """Fly: start the processes under the supervisor until stopped.
 
     In a terminal it prints once a second where it is and why, on stderr; logs are on stdout."""
-    from terrafix.runtime.supervisor import recently_killed_spec
-    from terrafix.runtime.supervisor import run as run_supervised
+    from terrafix.runtime import supervisor
 
-    configs = config or []
-    previous_run = recently_killed_spec(
-        source=source, start=start, map_path=map_path, link=link, out_dir=out, configs=configs
+    options = supervisor.RunOptions(
+        out_dir=out,
+        configs=config or [],
+        source=source,
+        map_path=map_path,
+        link=link,
+        start=start,
+        stop_after_source=until_end,
     )
+    previous_run = supervisor.recently_killed_spec(options)
     if previous_run is not None:
-        package, ground_amsl_m = map_path, previous_run.ground_amsl_m
+        options = replace(options, ground_amsl_m=previous_run.ground_amsl_m)
     else:
         from terrafix_tools.live import package_for_in_child
 
-        package, ground_amsl_m = package_for_in_child(source, start, map_path, configs)
+        package, ground_amsl_m = package_for_in_child(source, start, map_path, config or [])
+        options = replace(options, map_path=package, ground_amsl_m=ground_amsl_m)
     with _run_line() as on_run_dir:
-        code = run_supervised(
-            source=source,
-            start=start,
-            map_path=package,
-            ground_amsl_m=ground_amsl_m,
-            link=link,
-            out_dir=out,
-            configs=configs,
-            stop_after_source=until_end,
-            on_run_dir=on_run_dir,
-            fork_server=context.obj,
-        )
+        callbacks = supervisor.RunCallbacks(on_run_dir=on_run_dir)
+        code = supervisor.run(options, callbacks, fork_server=context.obj)
     if until_end and code == 0:  # not at a shutdown of the vehicle: reading a long record takes too long
         from terrafix_tools.flight_verdict import verdict_of
 

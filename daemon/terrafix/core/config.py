@@ -90,7 +90,7 @@ class HealthSection(Section, frozen=True, kw_only=True):
     critical_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0
 
 
-class Source(Section, frozen=True, kw_only=True):
+class SourceSection(Section, frozen=True, kw_only=True):
     path: str = ""  # flight folder, photo folder, video file, /dev/video* or a GStreamer pipeline
     realtime: bool = True  # play a recorded source in real time (live shell only)
     start: str = ""  # "LAT,LON" in degrees, overrides the source; the command line overrides it
@@ -115,7 +115,7 @@ class Config(Section, frozen=True, kw_only=True):
     models: Models = Models()
     places: Places = Places()
     vision: Vision = Vision()
-    source: Source = Source()
+    source: SourceSection = SourceSection()
     link: LinkSection = LinkSection()
     recorder: RecorderSection = RecorderSection()
     health: HealthSection = HealthSection()

@@ -15,7 +15,7 @@ from terrafix.core.config import LinkSection
 from terrafix.link.admission.packet_filter import Admission
 from terrafix.link.admission.served_autopilot import AUTOPILOT_COMPONENT, Role
 from terrafix.link.autopilot.autopilot_prior import AutopilotPrior
-from terrafix.link.autopilot.checkpoint import CheckpointWriter
+from terrafix.link.autopilot.checkpoint import LinkCheckpointWriter
 from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder
 from terrafix.link.autopilot.packet_decoder import PacketDecoder
 from terrafix.link.autopilot.telemetry import candidate_attitude
@@ -65,7 +65,7 @@ CANDIDATE_STREAMS_HZ = {mavlink.MAVLINK_MSG_ID_ATTITUDE: 10.0}
 
 
 def open_edge(config: LinkSection, checkpoint_file: Path | None = None, state_dir: Path | None = None) -> "MavlinkEdge":
-    """Opens the device of the configuration. ``checkpoint_file``: see ``CheckpointWriter``. ``state_dir``: see
+    """Opens the device of the configuration. ``checkpoint_file``: see ``LinkCheckpointWriter``. ``state_dir``: see
     ``PreviousSourceFile``.
 
     Raises LinkError with advice when the device cannot be opened, ConfigError when the signing key cannot be used."""
@@ -75,7 +75,7 @@ def open_edge(config: LinkSection, checkpoint_file: Path | None = None, state_di
         transport,
         time.time_ns,
         on_status=StatusLog().log,
-        checkpoint_writer=CheckpointWriter(checkpoint_file),
+        checkpoint_writer=LinkCheckpointWriter(checkpoint_file),
         previous_source=PreviousSourceFile(state_dir),
     )
 
@@ -90,11 +90,11 @@ class MavlinkEdge:
         wall_clock_ns: Callable[[], int],
         *,
         on_status: Callable[[LinkStatus], None] = lambda _: None,
-        checkpoint_writer: CheckpointWriter | None = None,
+        checkpoint_writer: LinkCheckpointWriter | None = None,
         previous_source: PreviousSourceFile | None = None,
     ) -> None:
         """``wall_clock_ns``: Unix time of this computer. ``on_status`` is called with every LinkStatus, for the log."""
-        self._checkpoint = checkpoint_writer or CheckpointWriter(None)
+        self._checkpoint = checkpoint_writer or LinkCheckpointWriter(None)
         self._restore_pending = self._checkpoint.restored is not None
         self._config = config
         self._on_status = on_status

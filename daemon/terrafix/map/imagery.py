@@ -24,7 +24,7 @@ KNOTS = np.array([(s, t, 1.0) for t in (0.0, 0.5, 1.0) for s in (0.0, 0.5, 1.0)]
 FIT_AFFINE = np.linalg.pinv(KNOTS)
 
 
-class Block(NamedTuple):
+class ImageBlock(NamedTuple):
     """A part of a window: first row and column, height and width in pixels."""
 
     row: int
@@ -36,10 +36,10 @@ class Block(NamedTuple):
     def slices(self) -> tuple[slice, slice]:
         return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
 
-    def quarters(self) -> list["Block"]:
+    def quarters(self) -> list["ImageBlock"]:
         """Four parts; two when one side is too short to halve."""
         rows = _split_half(self.row, self.height)
-        return [Block(r, c, h, w) for r, h in rows for c, w in _split_half(self.column, self.width)]
+        return [ImageBlock(r, c, h, w) for r, h in rows for c, w in _split_half(self.column, self.width)]
 
 
 class LayerView:
@@ -63,7 +63,7 @@ class LayerView:
         mask = np.zeros((height_px, width_px), np.uint8)
         level = self._level_for(gsd_m)
         blocks = [
-            Block(row, column, min(BLOCK_PX, height_px - row), min(BLOCK_PX, width_px - column))
+            ImageBlock(row, column, min(BLOCK_PX, height_px - row), min(BLOCK_PX, width_px - column))
             for row in range(0, height_px, BLOCK_PX)
             for column in range(0, width_px, BLOCK_PX)
         ]
@@ -71,7 +71,7 @@ class LayerView:
             uv = self._project(blocks, e_min_m, n_max_m, gsd_m, level)
             affine = FIT_AFFINE @ uv
             error_px = np.abs(KNOTS @ affine - uv).max(axis=(1, 2))  # NaN outside the projection domain: left empty
-            to_split: list[Block] = []
+            to_split: list[ImageBlock] = []
             for i, block in enumerate(blocks):
                 if error_px[i] > AFFINE_TOLERANCE_PX and max(block.height, block.width) > MIN_BLOCK_PX:
                     to_split += block.quarters()
@@ -88,7 +88,9 @@ class LayerView:
                 return level
         return self._layer.levels[-1]
 
-    def _project(self, blocks: list[Block], e_min_m: float, n_max_m: float, gsd_m: float, level: Level) -> np.ndarray:
+    def _project(
+        self, blocks: list[ImageBlock], e_min_m: float, n_max_m: float, gsd_m: float, level: Level
+    ) -> np.ndarray:
         """(blocks, 9, 2): column and row in the level at the knots of each block; integers are pixel centres."""
         offsets = np.array([(b.column, b.row) for b in blocks])[:, None]
         sizes = np.array([(b.width, b.height) for b in blocks])[:, None]

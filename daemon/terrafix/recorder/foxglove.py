@@ -21,7 +21,7 @@ BODY_FRAME = "body"
 KNOWN = 3  # position_covariance_type of foxglove.LocationFix: all elements
 
 
-class Level(IntEnum):
+class LogLevel(IntEnum):
     """Of foxglove.Log."""
 
     DEBUG = 1
@@ -108,7 +108,7 @@ CHANNELS: dict[str, type[Stamped]] = {
     IMAGE_TOPIC: CompressedImage,
 }
 
-_LEVELS = {"debug": Level.DEBUG, "info": Level.INFO, "warning": Level.WARNING, "error": Level.ERROR}
+_LEVELS = {"debug": LogLevel.DEBUG, "info": LogLevel.INFO, "warning": LogLevel.WARNING, "error": LogLevel.ERROR}
 
 
 class FoxgloveMessages:

@@ -10,7 +10,8 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -45,50 +46,73 @@ SQLITE_MAGIC = b"SQLite format 3\0"  # a map package is a GeoPackage, and that i
 DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
 
+@dataclass(frozen=True)
+class RunOptions:
+    """The options of `terrafix run`. ``source``, ``map_path`` (a map package), ``link``, ``start`` ("LAT,LON") override
+    the configuration when not empty."""
+
+    out_dir: Path
+    configs: Sequence[Path] = ()
+    source: str = ""
+    map_path: Path | None = None
+    link: str = ""
+    start: str = ""
+    ground_amsl_m: float | None = None  # of the map at the start, for a source without one
+    stop_after_source: bool = False  # else it runs until a signal
+    log_to: Path | None = None  # file for all logs and tracebacks instead of stdout and stderr
+
+    def config(self) -> Config:
+        """The files of ``configs`` with the options that override them. Raises ConfigError."""
+        replace = msgspec.structs.replace
+        config = configuration.load([*self.configs])
+        source, start = self.source or config.source.path, self.start or config.source.start
+        return replace(
+            config,
+            source=replace(config.source, path=source, start=start),
+            map=replace(config.map, path=str(self.map_path or config.map.path)),
+            link=replace(config.link, device=self.link or config.link.device),
+        )
+
+
+@dataclass(frozen=True)
+class RunCallbacks:
+    """What the caller of a run wants to know. Called in the thread of the supervisor."""
+
+    on_event: Callable[[ProcessEvent], None] | None = None  # all events of the processes
+    # once, with the t_ns of the first Origin: the zero of a recorded source on the monotonic clock
+    on_epoch: Callable[[int], None] | None = None
+    on_run_dir: Callable[[RunDir], None] | None = None  # once, with the run folder
+
+
 def run(
+    options: RunOptions,
+    callbacks: RunCallbacks = RunCallbacks(),
     *,
-    source: str,
-    map_path: Path | None,
-    link: str,
-    out_dir: Path,
-    configs: list[Path],
-    start: str = "",
-    ground_amsl_m: float | None = None,
-    stop_after_source: bool = False,
-    on_event: Callable[[ProcessEvent], None] | None = None,
-    on_epoch: Callable[[int], None] | None = None,
-    on_run_dir: Callable[[RunDir], None] | None = None,
     stop: threading.Event | None = None,
-    log_to: Path | None = None,
     table: tuple[Process, ...] = PROCESSES,
     fork_server: ForkServer | None = None,
 ) -> int:
-    """Runs until a signal, until ``stop`` is set, or (``stop_after_source``) until the end of the source.
+    """Runs until a signal, until ``stop`` is set, or until the end of the source if the options say so.
 
-    ``source``, ``map_path`` (a map package), ``link``, ``start`` ("LAT,LON"): override the configuration when not
-    empty. ``ground_amsl_m``: ground height of the map at the start, for a source without one. ``on_event`` receives all
-    events of the processes. ``on_epoch`` is called once with the t_ns of the first Origin, which is the zero of a
-    recorded source on the monotonic clock, ``on_run_dir`` once with the run folder. ``log_to``: file for all logs and
-    tracebacks instead of stdout and stderr.
     ``fork_server``: one that the caller has started and closes; None: own one.
 
     Returns 0, or 1 when the link was given up, or the exit code of a process that could not start because of a user
     error, which is written to stderr in one line. Raises ConfigError, MapError, OutputError before any start."""
-    config = _with_overrides(configuration.load(configs), source, start, map_path, link)
+    config = options.config()
     table = _configured(table, config)
-    out_dir = _writable(out_dir)
+    out_dir = _writable(options.out_dir)
     package = _map_package(config.map.path)
     with contextlib.ExitStack() as stack:
-        output = stack.enter_context(log_to.open("a", encoding="utf-8")) if log_to else None
+        output = stack.enter_context(options.log_to.open("a", encoding="utf-8")) if options.log_to else None
         stack.enter_context(
             contextlib.closing(logs.configure(config.log.level, SUPERVISOR, output or systemd.log_stream()))
         )
         logs.get().info("start", config=msgspec.to_builtins(config), map=str(package), out_dir=str(out_dir))
-        spec = msgspec.json.encode(spec_of(table, config, package, out_dir, ground_amsl_m))
+        spec = msgspec.json.encode(spec_of(table, config, package, out_dir, options.ground_amsl_m))
         owned = OwnedRunDir(spec=spec, resume=is_camera(config.source.path))
         stack.callback(owned.remove)
-        if on_run_dir:
-            on_run_dir(owned.run_dir)
+        if callbacks.on_run_dir:
+            callbacks.on_run_dir(owned.run_dir)
         if owned.run_dir.epoch_ns is not None:
             logs.get().warning("resumes a run that was killed", epoch_ns=owned.run_dir.epoch_ns)
         stop_signal = stack.enter_context(StopSignal(signal.SIGTERM, signal.SIGINT))  # for the ordered stop
@@ -99,11 +123,11 @@ def run(
             children,
             *_bus(stack, context, owned.run_dir, table),
             lambda: stop_signal() or (stop is not None and stop.is_set()),
-            stop_after_source,
-            on_event,
+            options.stop_after_source,
+            callbacks.on_event,
         )
-        if on_epoch:
-            supervisor.report_epoch(owned.run_dir, on_epoch)
+        if callbacks.on_epoch:
+            supervisor.report_epoch(owned.run_dir, callbacks.on_epoch)
         owned.keep_for_successor = True  # also when a bug ends this process
         code = supervisor.run()
         owned.keep_for_successor = code == LINK_GAVE_UP
@@ -128,13 +152,11 @@ def _write_user_errors(children: list[ManagedProcess]) -> None:
         sys.stderr.write(f"terrafix: {user_error.text}\n")
 
 
-def recently_killed_spec(
-    *, source: str, map_path: Path | None, link: str, out_dir: Path, configs: list[Path], start: str = ""
-) -> Spec | None:
-    """The spec of a run with the same arguments (as for ``run``) that was killed in the flight in progress.
+def recently_killed_spec(options: RunOptions) -> Spec | None:
+    """The spec of a run with the same options that was killed in the flight in progress.
 
     With it a restart in flight need not inspect the map again. None: there is no such run. Raises ConfigError."""
-    config = _with_overrides(configuration.load(configs), source, start, map_path, link)
+    config = options.config()
     if not config.map.path or not is_camera(config.source.path):
         return None
     for killed in recently_killed_runs():
@@ -142,7 +164,7 @@ def recently_killed_spec(
             spec = msgspec.json.decode(killed.spec.read_bytes(), type=Spec)
             package = Path(config.map.path).resolve()
             table = _configured(PROCESSES, config)
-            if spec == spec_of(table, config, package, out_dir.resolve(), spec.ground_amsl_m):
+            if spec == spec_of(table, config, package, options.out_dir.resolve(), spec.ground_amsl_m):
                 return spec
     return None
 
@@ -253,19 +275,6 @@ class Supervisor:
         """Whether the link makes progress; in a table without link, whether all processes do."""
         required = [c for c in self._children if c.process.name == REQUIRED_PROCESS] or self._children
         return all(now - c.progress.stamp_ns < c.process.stuck_after_s * 1e9 for c in required)
-
-
-def _with_overrides(config: Config, source: str, start: str, map_path: Path | None, link: str) -> Config:
-    replace = msgspec.structs.replace
-    if source:
-        config = replace(config, source=replace(config.source, path=source))
-    if start:
-        config = replace(config, source=replace(config.source, start=start))
-    if map_path:
-        config = replace(config, map=replace(config.map, path=str(map_path)))
-    if link:
-        config = replace(config, link=replace(config.link, device=link))
-    return config
 
 
 def _writable(out_dir: Path) -> Path:

@@ -14,7 +14,7 @@ import numpy as np
 
 from origins import origin_of
 from terrafix import messages as m
-from terrafix.core.config import Config, Map, Source
+from terrafix.core.config import Config, Map, SourceSection
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
 from terrafix.recorder.provenance import RECORD_FORMAT
 from terrafix.recorder.writer import FlightWriter
@@ -53,7 +53,9 @@ class Invented:
     def header(self) -> dict[str, str]:
         place, camera = PLACES[self.number % len(PLACES)][0], CAMERAS[self.number // 3 % len(CAMERAS)][0]
         version = VERSIONS[min(len(VERSIONS) - 1, self.day * len(VERSIONS) // 365)]
-        config = Config(map=Map(path=f"maps/{place}.gpkg"), source=Source(camera=f"config/cameras/{camera}.toml"))
+        config = Config(
+            map=Map(path=f"maps/{place}.gpkg"), source=SourceSection(camera=f"config/cameras/{camera}.toml")
+        )
         versions = {"terrafix": version, "git": f"v{version}", "python": "3.11"}
         encode = msgspec.json.encode
         return {"format": RECORD_FORMAT, "config": encode(config).decode(), "versions": encode(versions).decode()}

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
 from terrafix.core.config import LinkSection
-from terrafix.link.autopilot.checkpoint import CheckpointWriter
+from terrafix.link.autopilot.checkpoint import LinkCheckpointWriter
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.gnss.previous_source import PreviousSourceFile
 from terrafix.link.mavlink.transport import Address, Chunk
@@ -76,7 +76,7 @@ class WiredEdge(PolledEdge):
     ) -> None:
         self.wire = MemoryWire()
         self._senders: dict[tuple[int, int], mavlink.MAVLink] = {}
-        writer = CheckpointWriter(checkpoint)
+        writer = LinkCheckpointWriter(checkpoint)
         files: Any = {"checkpoint_writer": writer, "previous_source": previous_source}
         super().__init__(MavlinkEdge(LinkSection(**config), self.wire, lambda: unix_ns, **files))
 

@@ -11,7 +11,7 @@ from link_rig import MS, S
 from link_wire import armed, attitude, decoded, packed, states
 from terrafix.core.mavlink.airspeed import UNHEALTHY, USED, AirspeedReader
 from terrafix.core.mavlink.tlog import read_tlog, record
-from terrafix.link.autopilot.telemetry import Telemetry
+from terrafix.link.autopilot.telemetry import TelemetryDecoder
 from terrafix.link.mavlink.timesync import TimeSync
 from terrafix.messages import VehicleState
 
@@ -25,7 +25,7 @@ def airspeed(mps: float, sensor: int = 0, flags: int = USED) -> Any:
 
 def published(messages: list[tuple[int, Any]]) -> list[VehicleState]:
     """(arrival time, message) -> published vehicle states."""
-    telemetry = Telemetry(TimeSync())
+    telemetry = TelemetryDecoder(TimeSync())
     answers = [telemetry.on_message(decoded(message), now_ns) for now_ns, message in [(0, armed()), *messages]]
     return states(answer for answer in answers if answer is not None)
 

@@ -11,7 +11,7 @@ from link_rig import MS, S
 from link_wire import armed, decoded
 from terrafix.core.mavlink.imu import boot_ns, imu_readings
 from terrafix.core.mavlink.tlog import read_imu, record
-from terrafix.link.autopilot.telemetry import Telemetry
+from terrafix.link.autopilot.telemetry import TelemetryDecoder
 from terrafix.link.mavlink.timesync import TimeSync
 from terrafix.messages import Imu
 
@@ -34,7 +34,7 @@ def highres(boot_us: int) -> Any:
 
 def published(messages: list[tuple[int, Any]]) -> list[Imu]:
     """(arrival time, message) -> published Imu messages."""
-    telemetry = Telemetry(TimeSync())
+    telemetry = TelemetryDecoder(TimeSync())
     telemetry.on_message(decoded(armed()), 0)
     answers = [telemetry.on_message(decoded(message), now_ns) for now_ns, message in messages]
     return [a for a in answers if isinstance(a, Imu)]
@@ -107,7 +107,7 @@ def test_the_selection_does_not_alternate_between_equally_fast_imu_streams() -> 
 
 
 def test_imu_messages_of_another_system_or_component_are_ignored() -> None:
-    telemetry = Telemetry(TimeSync())
+    telemetry = TelemetryDecoder(TimeSync())
     telemetry.on_message(decoded(armed()), 0)
     for i in range(1, 20):
         assert telemetry.on_message(decoded(raw(0), sysid=9), i * 20 * MS) is None

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from link_wire import WiredEdge, armed, attitude, heartbeat, states
 from terrafix.estimator.prior import load_checkpoint
-from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter
+from terrafix.link.autopilot.checkpoint import ArmedAutopilot, LinkCheckpointWriter
 
 S = 1_000_000_000
 
@@ -44,13 +44,13 @@ def test_an_unreadable_checkpoint_is_ignored(tmp_path: Path) -> None:
     for name, data in (("cut", b"\x85\xa8"), ("other", b'{"autopilot": 7}'), ("empty", b"")):
         (tmp_path / name).write_bytes(data)
         assert load_checkpoint(tmp_path / name) is None
-        assert CheckpointWriter(tmp_path / name).restored is None
+        assert LinkCheckpointWriter(tmp_path / name).restored is None
     assert load_checkpoint(tmp_path / "none") is None and load_checkpoint(None) is None
 
 
 def test_a_checkpoint_that_cannot_be_written_does_not_raise(tmp_path: Path) -> None:
     """For example when shared memory is full."""
-    checkpoint_writer = CheckpointWriter(tmp_path / "not there" / "link.checkpoint")
+    checkpoint_writer = LinkCheckpointWriter(tmp_path / "not there" / "link.checkpoint")
     checkpoint_writer.on_heartbeat(ArmedAutopilot(sysid=1, firmware=3, vehicle=1))
     checkpoint_writer.on_fix(None, 2.0)
     checkpoint_writer.on_heartbeat(None)

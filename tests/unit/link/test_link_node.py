@@ -31,7 +31,7 @@ from terrafix.core.config import Config
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import NodeContext
-from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter
+from terrafix.link.autopilot.checkpoint import ArmedAutopilot, LinkCheckpointWriter
 from terrafix.link.integrity import fix_type
 from terrafix.link.integrity.output_predictor import (
     InertialBuffer,
@@ -447,7 +447,7 @@ def test_a_restarted_link_continues_with_the_clock_of_the_checkpoint(tmp_path: P
     first = LinkNode(10.0)
     first.on(m.WallClock(t_ns=50 * S, unix_ns=unix, source="system"))
     checkpoint = tmp_path / "link.checkpoint"
-    CheckpointWriter(checkpoint).on_heartbeat(ArmedAutopilot(1, 3, 1))
+    LinkCheckpointWriter(checkpoint).on_heartbeat(ArmedAutopilot(1, 3, 1))
     link = WiredEdge(checkpoint=checkpoint)
     for sent in gps(fly(first, 100 * S, 101 * S, every(500 * MS, estimate))):
         link.edge.on_message(sent)

@@ -22,7 +22,7 @@ from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
 from terrafix.link.integrity.output_predictor import east_north_m, offset
 from terrafix.link.output import global_position, gps_time, msp, nmea, odometry
-from terrafix.link.output.odometry import Attitude, GeodeticPoint
+from terrafix.link.output.odometry import GeodeticPoint, VehicleAttitude
 from terrafix.link.output.selection import PositionOutputs
 from terrafix.link.output.serial_outputs import open_serial_outputs
 from terrafix_lab.sim.autopilot.parameters import Kind
@@ -35,7 +35,7 @@ PLACE: dict[str, Any] = {"lat_deg": 48.117_300_5, "lon_deg": -11.516_666_7, "alt
 GPS = msgspec.structs.replace(gps_messages.GPS, time_week=WEEK, time_week_ms=WEEK_MS, vn_mps=-3.0, ve_mps=4.0, **PLACE)
 NO_FIX = msgspec.structs.replace(GPS, fix_type=1, lat_deg=0.0, lon_deg=0.0, satellites_visible=0, time_week=0)
 ORIGIN = GeodeticPoint(48.0, -11.5, 500.0)
-BANKED = Attitude(0.4, -0.2, 2.5)
+BANKED = VehicleAttitude(0.4, -0.2, 2.5)
 
 
 # --- ODOMETRY and VISION_POSITION_ESTIMATE ---
@@ -79,7 +79,7 @@ def test_px4_gets_metres_on_its_sphere_in_the_frame_local_ned() -> None:
     assert odometry.position_ned_m(at_origin, ORIGIN, ardupilot=False)[:2] == (0.0, 0.0)
 
 
-def body_to_ned(a: Attitude) -> np.ndarray:
+def body_to_ned(a: VehicleAttitude) -> np.ndarray:
     cr, sr, cp, sp, cy, sy = (f(x) for x in (a.roll_rad, a.pitch_rad, a.yaw_rad) for f in (math.cos, math.sin))
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])

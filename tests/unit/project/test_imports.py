@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -95,6 +96,33 @@ def test_below_the_lab_only_the_table_of_commands_names_it() -> None:
     }
     in_table = sum(path.startswith("terrafix_lab.") for path in cli.MODULES.values())
     assert {module: count for module, count in named.items() if count} == {"terrafix_tools.cli": in_table}
+
+
+# Names of public classes that still have two meanings in their package.
+TWO_MEANINGS = {
+    "terrafix": {"Hypothesis"},
+    "terrafix_engines": set(),
+    "terrafix_tools": {
+        *("Answer", "Area", "Change", "Chunk", "Estimate", "Event", "Grid", "Limits", "Placed", "Record", "Request"),
+        *("Service", "Status"),
+    },
+    "terrafix_lab": {
+        *("Case", "Criterion", "Fault", "Flight", "Ground", "Guidance", "Kind", "Lens", "Line", "Motion", "Plan"),
+        *("Receiver", "Result", "Row", "Scene", "Switch", "Times", "Warp"),
+    },
+}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_name_of_a_public_class_means_one_thing_in_its_package(package: str) -> None:
+    defined = Counter(
+        node.name
+        for module, path in MODULES.items()
+        if module.split(".")[0] == package
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    assert {name for name, count in defined.items() if count > 1} <= TWO_MEANINGS[package]
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -21,7 +21,7 @@ from flight_records import ORIGIN, PERIOD_NS, estimate, live_messages, origin, w
 from terrafix import messages as m
 from terrafix.core.log_lines import MessageLog
 from terrafix.recorder import foxglove
-from terrafix.recorder.foxglove import CHANNELS, FoxgloveMessages, Level, Stamped
+from terrafix.recorder.foxglove import CHANNELS, FoxgloveMessages, LogLevel, Stamped
 
 PUBLISHED = {message.DESCRIPTOR.full_name: message for message in (CompressedImage, LocationFix, Log, PoseInFrame)}
 JSON_TYPES = {
@@ -122,20 +122,20 @@ def test_recorded_image_is_base64_of_the_file(recorded: dict[str, list[tuple[str
 @pytest.mark.parametrize(
     ("message", "level"),
     [
-        (m.StatusText(t_ns=7, severity=7, text="no map fix"), Level.DEBUG),
-        (m.StatusText(t_ns=7, severity=5, text="no map fix"), Level.INFO),
-        (m.SearchState(t_ns=7, step=m.SearchStep.WHOLE_MAP), Level.WARNING),
-        (m.ModelEvent(t_ns=7, model="a", change=m.ModelChange.GIVEN_UP, provider="CPU", detail=""), Level.ERROR),
+        (m.StatusText(t_ns=7, severity=7, text="no map fix"), LogLevel.DEBUG),
+        (m.StatusText(t_ns=7, severity=5, text="no map fix"), LogLevel.INFO),
+        (m.SearchState(t_ns=7, step=m.SearchStep.WHOLE_MAP), LogLevel.WARNING),
+        (m.ModelEvent(t_ns=7, model="a", change=m.ModelChange.GIVEN_UP, provider="CPU", detail=""), LogLevel.ERROR),
     ],
 )
-def test_a_line_of_the_log_has_the_level_of_foxglove(message: m.Message, level: Level) -> None:
+def test_a_line_of_the_log_has_the_level_of_foxglove(message: m.Message, level: LogLevel) -> None:
     entry = MessageLog().entry(message)
     assert entry is not None and logged(message) == (level, entry.part, entry.text)
 
 
 def test_a_line_of_the_log_of_a_process_is_recorded_with_its_fields() -> None:
     line = m.LogLine(t_ns=7, process="recorder", level="error", event="recording stopped", fields={"reason": "full"})
-    assert logged(line) == (Level.ERROR, "recorder", "recording stopped, reason full")
+    assert logged(line) == (LogLevel.ERROR, "recorder", "recording stopped, reason full")
 
 
 def test_accepted_measurements_are_not_logged() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from terrafix.runtime.supervisor import RunOptions
 from terrafix_tools import program
 
 RUN = ["terrafix", "run", "--map", "area.gpkg", "--source", "/dev/video0"]
@@ -41,13 +42,13 @@ def test_a_run_uses_the_fork_server_started_before_the_command_line(
 ) -> None:
     got: dict[str, Any] = {}
 
-    def run(**arguments: Any) -> int:
-        got.update(arguments, closed="closed" in fork_server.events)
+    def run(options: RunOptions, *_: object, **arguments: Any) -> int:
+        got.update(arguments, ground_amsl_m=options.ground_amsl_m, closed="closed" in fork_server.events)
         return 3
 
     spec = SimpleNamespace(ground_amsl_m=320.0)
     monkeypatch.setattr("terrafix.runtime.supervisor.run", run)
-    monkeypatch.setattr("terrafix.runtime.supervisor.recently_killed_spec", lambda **_: spec)
+    monkeypatch.setattr("terrafix.runtime.supervisor.recently_killed_spec", lambda _: spec)
     monkeypatch.delitem(sys.modules, "terrafix_tools.cli", raising=False)
     monkeypatch.setattr(sys, "argv", RUN)
     with pytest.raises(SystemExit) as ended:

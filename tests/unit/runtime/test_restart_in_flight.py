@@ -8,13 +8,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from terrafix.core.config import Config, LinkSection, Map, Source
+from terrafix.core.config import Config, LinkSection, Map, SourceSection
 from terrafix.processes import PROCESSES
 from terrafix.runtime import run_dir
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import PREFIX, OwnedRunDir, RunDir
 from terrafix.runtime.run_spec import is_camera, spec_of
-from terrafix.runtime.supervisor import recently_killed_spec
+from terrafix.runtime.supervisor import RunOptions, recently_killed_spec
 
 
 def killed(parent: Path, spec: bytes, age_s: float) -> RunDir:
@@ -80,11 +80,11 @@ def test_the_spec_of_a_recently_killed_run_is_found_so_that_the_map_is_not_inspe
 ) -> None:
     monkeypatch.setattr(run_dir, "SHM", tmp_path)
     package, out = tmp_path / "a.gpkg", tmp_path / "out"
-    config = Config(map=Map(path=str(package)), source=Source(path=CAMERA), link=LinkSection(device="udpin:h:1"))
+    config = Config(map=Map(path=str(package)), source=SourceSection(path=CAMERA), link=LinkSection(device="udpin:h:1"))
     spec = msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5))
 
     def ground_amsl_m(source: str = CAMERA, map_path: Path = package, link: str = "udpin:h:1") -> float | None:
-        before = recently_killed_spec(source=source, map_path=map_path, link=link, out_dir=out, configs=[])
+        before = recently_killed_spec(RunOptions(source=source, map_path=map_path, link=link, out_dir=out))
         return None if before is None else before.ground_amsl_m
 
     assert ground_amsl_m() is None
@@ -92,7 +92,7 @@ def test_the_spec_of_a_recently_killed_run_is_found_so_that_the_map_is_not_inspe
     assert ground_amsl_m() == 412.5
     assert ground_amsl_m(map_path=tmp_path / "b.gpkg") is None
     assert ground_amsl_m(link="udpin:h:2") is None
-    config = msgspec.structs.replace(config, source=Source(path=str(tmp_path)))
+    config = msgspec.structs.replace(config, source=SourceSection(path=str(tmp_path)))
     stale.spec.write_bytes(msgspec.json.encode(spec_of(PROCESSES, config, package, out, 412.5)))
     assert ground_amsl_m(source=str(tmp_path)) is None, "a recorded source is not resumed"
     stale.spec.write_bytes(b'{"of another version": 1}')

@@ -8,7 +8,7 @@ import pytest
 
 from source_folders import TOML, flight
 from terrafix.core.clock import now_ns
-from terrafix.core.config import Config, Source
+from terrafix.core.config import Config, SourceSection
 from terrafix.core.errors import MapError, SourceError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.initial_position import map_bounds, start_is_unknown, with_map_center
@@ -32,7 +32,7 @@ def package(path: Path, value: str = f"[{WEST}, {SOUTH}, {EAST}, {NORTH}]") -> P
 
 
 def context(folder: Path, map_path: Path | None) -> NodeContext:
-    config = Config(source=Source(path=str(folder)))
+    config = Config(source=SourceSection(path=str(folder)))
     return NodeContext(config=config, frames=MemoryFrameStore(), map_path=map_path, out_dir=folder)
 
 

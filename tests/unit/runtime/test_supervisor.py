@@ -26,7 +26,7 @@ from terrafix.processes import PROCESSES
 from terrafix.runtime import run_dir, systemd
 from terrafix.runtime.fork_server import ForkedProcess
 from terrafix.runtime.managed_process import RESTART_LIMIT, RESTART_WINDOW_NS, RestartWindow, State, describe
-from terrafix.runtime.supervisor import Supervisor, _configured, run
+from terrafix.runtime.supervisor import RunCallbacks, RunOptions, Supervisor, _configured, run
 
 pytestmark = pytest.mark.real_time
 
@@ -58,15 +58,15 @@ class Flight:
 
     def _run(self, config: Path, link: str, stop_after_source: bool) -> None:
         self.code = run(
-            source="",
-            map_path=None,
-            link=link,
-            out_dir=self.out_dir,
-            configs=[config],
-            stop_after_source=stop_after_source,
-            on_event=self.events.append,
+            RunOptions(
+                link=link,
+                out_dir=self.out_dir,
+                configs=[config],
+                stop_after_source=stop_after_source,
+                log_to=self.log,
+            ),
+            RunCallbacks(on_event=self.events.append),
             stop=self._stop,
-            log_to=self.log,
             table=TABLE,
         )
 
@@ -209,9 +209,9 @@ RUNNER = """
 import os, sys
 from pathlib import Path
 from runtime_nodes import TABLE
-from terrafix.runtime.supervisor import run
+from terrafix.runtime.supervisor import RunOptions, run
 source = os.environ.get("SOURCE", "")
-sys.exit(run(source=source, map_path=None, link="", out_dir=Path(sys.argv[1]), configs=[], table=TABLE))
+sys.exit(run(RunOptions(source=source, out_dir=Path(sys.argv[1])), table=TABLE))
 """
 
 
@@ -395,8 +395,7 @@ def test_restart_pauses_increase_until_the_process_is_given_up() -> None:
 
 def test_configuration_map_and_output_folder_are_checked_before_any_start(tmp_path: Path) -> None:
     def attempt(**changes: object) -> None:
-        arguments = {"source": "", "map_path": None, "link": "", "out_dir": tmp_path / "out", "configs": []}
-        run(**(arguments | changes), table=TABLE)  # type: ignore[arg-type]
+        run(RunOptions(**({"out_dir": tmp_path / "out"} | changes)), table=TABLE)  # type: ignore[arg-type]
 
     (tmp_path / "file").write_text("II*\0")
     with pytest.raises(OutputError, match=r"file/out: cannot be written .* another folder with --out"):

@@ -16,9 +16,8 @@ from typer.testing import CliRunner, Result
 import map_rasters
 from map_packages import centre_of
 from preflight_autopilot import GroundAutopilot
-from terrafix.core.config import Config, HealthSection, LinkSection, Models, RecorderSection
+from terrafix.core.config import Config, HealthSection, LinkSection, Models, RecorderSection, SourceSection
 from terrafix.core.config import Map as MapSection
-from terrafix.core.config import Source as SourceSection
 from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.signature import generate
 from terrafix.link.gnss.previous_source import PreviousSource, PreviousSourceFile

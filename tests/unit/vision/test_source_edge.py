@@ -10,8 +10,7 @@ import pytest
 
 from source_folders import flight, picture
 from terrafix.core.clock import now_ns
-from terrafix.core.config import Config, HealthSection
-from terrafix.core.config import Source as SourceSection
+from terrafix.core.config import Config, HealthSection, SourceSection
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext

@@ -36,7 +36,7 @@ from terrafix.vision.sources.images import decode_image
 from terrafix.vision.sources.mjpeg import MjpegCapture
 from terrafix.vision.sources.table import read_table
 from terrafix.vision.sources.xmp import read_xmp
-from terrafix_lab.sim.autopilot.fuzz_wire import UNIX_NS, Autopilot
+from terrafix_lab.sim.autopilot.fuzz_wire import UNIX_NS, FuzzedAutopilot
 from terrafix_lab.sim.autopilot.wire import heartbeat
 from terrafix_lab.sim.closed_loop.loopback import Loopback
 from terrafix_tools.autopilot_log.read import read_autopilot_log
@@ -131,7 +131,9 @@ def _logs() -> list[bytes]:
     """Telemetry logs: whole, torn at the front, with a clock that jumps, and of two vehicles."""
     (log,) = _telemetry()[1]
     packets = [
-        packet for step in range(STEPS) for packet in Autopilot(signed=False).packets(step, step * 20_000_000, b"")
+        packet
+        for step in range(STEPS)
+        for packet in FuzzedAutopilot(signed=False).packets(step, step * 20_000_000, b"")
     ]
     jumping = [
         record(47_000_000 + 20_000 * i + (10**15 if i > len(packets) // 2 else 0), p) for i, p in enumerate(packets)
@@ -157,7 +159,7 @@ def _tables() -> list[bytes]:
 @cache
 def _telemetry() -> tuple[list[bytes], list[bytes]]:
     """Packets of a short flight: as they arrive, and as a log."""
-    autopilot = Autopilot(signed=False)
+    autopilot = FuzzedAutopilot(signed=False)
     packets = [packet for step in range(STEPS) for packet in autopilot.packets(step, step * 20_000_000, b"")]
     log = b"".join(record(1_700_000_000_000_000 + 20_000 * i, packet) for i, packet in enumerate(packets))
     return [b"".join(packets), heartbeat(42)], [log]

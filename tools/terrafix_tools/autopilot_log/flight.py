@@ -26,7 +26,7 @@ class Sent:
 
 
 @dataclass(frozen=True)
-class Flight:
+class FlightSide:
     """Times are seconds since the origin of the record (its first message, if it has none)."""
 
     path: Path
@@ -37,7 +37,7 @@ class Flight:
     gps_id: int  # configured instance of our GPS_INPUT; 0 is the first
 
 
-def read_flight_side(path: Path) -> Flight:
+def read_flight_side(path: Path) -> FlightSide:
     """Reads a record: a file, or the folder of a replay or run. Raises SourceError."""
     result = ReadResult()
     attitude: list[tuple[int, float, float, float]] = []
@@ -66,7 +66,7 @@ def read_flight_side(path: Path) -> Flight:
             "clock is aligned; give the record of a flight with a link"
         )
     zero = zero_ns if zero_ns is not None else first_ns or 0
-    return Flight(
+    return FlightSide(
         path=path,
         end_s=(last_ns - zero) / NS,
         attitude=cleaned(Attitude(*_columns(attitude, 4, zero))),

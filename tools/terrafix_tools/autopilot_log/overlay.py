@@ -7,7 +7,7 @@ import numpy as np
 
 from terrafix.link.integrity.output_predictor import metres_per_degree
 from terrafix_tools.autopilot_log.alignment import Alignment, align
-from terrafix_tools.autopilot_log.flight import Flight, Sent
+from terrafix_tools.autopilot_log.flight import FlightSide, Sent
 from terrafix_tools.autopilot_log.structure import (
     AutopilotLog,
     Fusion,
@@ -26,7 +26,7 @@ FIX_3D = 3
 GATE = 1.0  # limit of a test ratio
 
 
-def overlay(flight: Flight, log: AutopilotLog) -> dict[str, Any]:
+def overlay(flight: FlightSide, log: AutopilotLog) -> dict[str, Any]:
     """Aligns the clocks and transfers the log. All times are seconds of the record; what lies outside of it is left
     out. Raises EvaluationError when the log is of another flight."""
     clock = align(flight.attitude, log.attitude)
@@ -265,7 +265,7 @@ def _sent_less_ekf(
     }
 
 
-def _events(flight: Flight, log: AutopilotLog, window: _Window) -> list[dict[str, Any]]:
+def _events(flight: FlightSide, log: AutopilotLog, window: _Window) -> list[dict[str, Any]]:
     times = window.times(np.array([event.t_s for event in log.events]))
     found = [
         {"t_s": round(float(t), 3), "kind": event.kind, "text": event.text}

@@ -49,7 +49,7 @@ def _checkpoint_file(file: Path | None) -> CheckpointFile[LinkCheckpoint]:
     return CheckpointFile(file, LinkCheckpoint, "json")
 
 
-class CheckpointWriter:
+class LinkCheckpointWriter:
     """Writes the checkpoint when its content changes. ``restored``: checkpoint found at the start.
 
     The file is deleted when the autopilot is not armed: a vehicle on the ground is at the start of its flight, and this

@@ -7,9 +7,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.link.autopilot.gnss_receiver import RECEIVERS, gnss_reading
-from terrafix.link.autopilot.telemetry import Telemetry
+from terrafix.link.autopilot.telemetry import TelemetryDecoder
 from terrafix.link.mavlink.timesync import TimeSync
-from terrafix.link.output.odometry import Attitude, GeodeticPoint
+from terrafix.link.output.odometry import GeodeticPoint, VehicleAttitude
 from terrafix.link.output.selection import AutopilotState
 from terrafix.messages import EkfStatus, Message, VehicleState
 
@@ -22,7 +22,7 @@ class PacketDecoder:
     """Processes the messages of the served autopilot (served_autopilot.py)."""
 
     def __init__(self, timesync: TimeSync) -> None:
-        self.telemetry = Telemetry(timesync)
+        self.telemetry = TelemetryDecoder(timesync)
         self._state: VehicleState | None = None  # the newest
         self._origin: GeodeticPoint | None = None  # of its EKF
 
@@ -57,7 +57,7 @@ class PacketDecoder:
         state, attitude = self._state, None
         if state is not None and now_ns - state.t_ns < ATTITUDE_TIMEOUT_NS:
             angles_rad = [a for a in (state.roll_rad, state.pitch_rad, state.yaw_rad) if a is not None]
-            attitude = Attitude(*angles_rad) if len(angles_rad) == 3 else None
+            attitude = VehicleAttitude(*angles_rad) if len(angles_rad) == 3 else None
         return AutopilotState(self.firmware, self.sysid, attitude, self._origin)
 
 

@@ -31,7 +31,7 @@ MAX_HEIGHT_M = 20_000.0  # larger heights are ignored [tuned]
 IMU_BATCH_NS = 40_000_000
 
 
-class Telemetry:
+class TelemetryDecoder:
     """Processes each decoded message of the served autopilot (served_autopilot.py): -> a VehicleState with each
     ATTITUDE, an Imu with each batch of readings."""
 

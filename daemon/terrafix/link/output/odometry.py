@@ -35,7 +35,7 @@ class GeodeticPoint:
 
 
 @dataclass(frozen=True)
-class Attitude:
+class VehicleAttitude:
     """The autopilot's newest attitude: rotation of the body (FRD) in the frame north, east, down."""
 
     roll_rad: float
@@ -90,7 +90,7 @@ def pose_covariance(gps: GpsInput, *, ardupilot: bool) -> list[float]:
 
 
 def odometry(
-    gps: GpsInput, origin: GeodeticPoint, attitude: Attitude, *, ardupilot: bool
+    gps: GpsInput, origin: GeodeticPoint, attitude: VehicleAttitude, *, ardupilot: bool
 ) -> mavlink.MAVLink_odometry_message:
     """ODOMETRY with the velocity in body axes; the autopilot rotates it back with the quaternion of the same message.
 
@@ -119,7 +119,7 @@ def odometry(
 
 
 def vision_position(
-    gps: GpsInput, origin: GeodeticPoint, attitude: Attitude, *, ardupilot: bool
+    gps: GpsInput, origin: GeodeticPoint, attitude: VehicleAttitude, *, ardupilot: bool
 ) -> mavlink.MAVLink_vision_position_estimate_message:
     return mavlink.MAVLink_vision_position_estimate_message(
         gps.t_ns // 1000,
@@ -132,7 +132,7 @@ def vision_position(
     )
 
 
-def quaternion_from_euler(attitude: Attitude) -> tuple[float, float, float, float]:
+def quaternion_from_euler(attitude: VehicleAttitude) -> tuple[float, float, float, float]:
     """-> (w, x, y, z), body to north, east, down; rotations in the order yaw, pitch, roll."""
     cr, sr = math.cos(attitude.roll_rad / 2), math.sin(attitude.roll_rad / 2)
     cp, sp = math.cos(attitude.pitch_rad / 2), math.sin(attitude.pitch_rad / 2)

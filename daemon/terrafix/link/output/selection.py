@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.core.clock import NS_PER_S
 from terrafix.core.config import OutputName
 from terrafix.link.output import global_position, gps_input, odometry
-from terrafix.link.output.odometry import Attitude, GeodeticPoint
+from terrafix.link.output.odometry import GeodeticPoint, VehicleAttitude
 from terrafix.messages import GpsInput
 
 EXTERNAL_POSITION_PERIOD_NS = 5 * NS_PER_S  # ns; rare, because each one is a hard reset of the EKF [tuned]
@@ -25,7 +25,7 @@ class AutopilotState:
 
     firmware: str  # "ardupilot", "px4", ..., "none" before its first heartbeat
     sysid: int
-    attitude: Attitude | None  # None: not known, or too old
+    attitude: VehicleAttitude | None  # None: not known, or too old
     origin: GeodeticPoint | None
 
 

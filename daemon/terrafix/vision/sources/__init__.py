@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from terrafix.core.config import Source as SourceSection
+from terrafix.core.config import SourceSection
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources.contract import Shot, Source
 from terrafix.vision.sources.images import IMAGE_SUFFIXES, is_image_name

@@ -24,7 +24,7 @@ from terrafix.link.admission.served_autopilot import (
     change_text,
     pilot_text,
 )
-from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter, load_checkpoint
+from terrafix.link.autopilot.checkpoint import ArmedAutopilot, LinkCheckpointWriter, load_checkpoint
 from terrafix.link.autopilot.ekf_dead_reckoning import EkfState, LastFix
 from terrafix.link.edge import open_edge
 from terrafix.link.mavlink.transport import MAX_PEERS, UdpOut
@@ -207,7 +207,7 @@ def test_a_vehicle_with_telemetry_is_served_instead_of_one_that_sends_heartbeats
 def test_after_a_restart_another_vehicle_is_served_only_if_the_last_one_never_used_a_fix(
     tmp_path: Path, has_fix: bool
 ) -> None:
-    writer = CheckpointWriter(tmp_path / "link.checkpoint")
+    writer = LinkCheckpointWriter(tmp_path / "link.checkpoint")
     writer.on_heartbeat(ArmedAutopilot(9, 3, 1))
     if has_fix:
         writer.on_fix(LAST_FIX, 0.0)
@@ -241,7 +241,7 @@ def test_a_restarted_link_serves_the_address_from_the_checkpoint(
 
 
 def test_a_checkpoint_of_another_system_id_than_configured_is_ignored(tmp_path: Path) -> None:
-    CheckpointWriter(tmp_path / "link.checkpoint").on_heartbeat(ArmedAutopilot(7, 3, 1))
+    LinkCheckpointWriter(tmp_path / "link.checkpoint").on_heartbeat(ArmedAutopilot(7, 3, 1))
     link = WiredEdge(checkpoint=tmp_path / "link.checkpoint", autopilot_sysid=9)
     link.poll(S)
     assert not link.status().connected

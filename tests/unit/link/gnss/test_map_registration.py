@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from gnss_rig import READING_AGE_NS, accurate, feed_receiver, reading
 from link_rig import LAT, LON, SPEED_EAST, S, estimate
 from terrafix import messages as m
-from terrafix.link.autopilot.checkpoint import ArmedAutopilot, CheckpointWriter, load_checkpoint
+from terrafix.link.autopilot.checkpoint import ArmedAutopilot, LinkCheckpointWriter, load_checkpoint
 from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder
 from terrafix.link.gnss.map_registration import (
     MAX_DISTANCE_SIGMAS,
@@ -223,7 +223,7 @@ def test_readings_over_two_layers_are_not_one_batch() -> None:
 
 def test_a_restarted_link_continues_with_the_map_offset_of_the_checkpoint(tmp_path: Path) -> None:
     published = fly_with_receiver(node_with_map_offset(), 240.0)
-    checkpoint_writer = CheckpointWriter(tmp_path / "link")
+    checkpoint_writer = LinkCheckpointWriter(tmp_path / "link")
     checkpoint_writer.on_heartbeat(ArmedAutopilot(1, 3, 1))
     checkpoint_writer.on_map_offset(map_offsets(published)[-1])
     checkpoint_writer.on_fix(None, 0.0)

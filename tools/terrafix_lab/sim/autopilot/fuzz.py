@@ -28,8 +28,8 @@ from terrafix_lab.sim.autopilot.fuzz_wire import (
     ROLL,
     UNIX_NS,
     YAW,
-    Autopilot,
     BadWire,
+    FuzzedAutopilot,
     add_garbage,
     split,
     transmit,
@@ -68,7 +68,7 @@ def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) 
         key.write_bytes(KEY)
         loopback = Loopback()
         edge = MavlinkEdge(LinkSection(signing_key=str(key) if signed else ""), loopback, lambda: UNIX_NS)
-    node, autopilot, rng = LinkNode(10.0), Autopilot(signed), random.Random(seed)
+    node, autopilot, rng = LinkNode(10.0), FuzzedAutopilot(signed), random.Random(seed)
     result = Result(seconds=seconds, wire=asdict(wire))
     steps = round(seconds * TICK_HZ)
     delayed: list[bytes] = []

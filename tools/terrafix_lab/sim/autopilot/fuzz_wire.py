@@ -24,7 +24,7 @@ class BadWire:
     late: float = 0.0  # arrives after the packets of the next step
 
 
-class Autopilot:
+class FuzzedAutopilot:
     """True telemetry of a vehicle that flies east."""
 
     def __init__(self, signed: bool) -> None:

@@ -91,15 +91,15 @@ def fly(
     watcher.start()
     try:
         exit_code = supervisor.run(
-            source=str(folder),
-            map_path=map_path,
-            link=f"udpout:127.0.0.1:{port}",
-            out_dir=out,
-            configs=[],
-            stop_after_source=True,
-            on_event=on_event,
-            on_epoch=clock.start,
-            log_to=out / "terrafix.log",
+            supervisor.RunOptions(
+                source=str(folder),
+                map_path=map_path,
+                link=f"udpout:127.0.0.1:{port}",
+                out_dir=out,
+                stop_after_source=True,
+                log_to=out / "terrafix.log",
+            ),
+            supervisor.RunCallbacks(on_event=on_event, on_epoch=clock.start),
         )
     finally:
         land()
