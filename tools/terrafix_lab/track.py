@@ -83,6 +83,8 @@ def measured(tracks: Sequence[Track]) -> dict[str, str]:
     for name, row in CRITERIA.items():
         values = [value for track in tracks if (value := row.measure(track)) is not None]
         never = sum(map(math.isinf, values))
-        shown = f"{row.of([v for v in values if v < math.inf] or [0.0]):g} {row.unit}".strip() if values else "-"
+        shown = (
+            f"{round(row.of([v for v in values if v < math.inf] or [0.0]), 2):g} {row.unit}".strip() if values else "-"
+        )
         found[name] = f"never in {never} of {len(values)} flights" if never else shown
     return found
