@@ -508,11 +508,14 @@ class PoseSolution(Message, frozen=True, kw_only=True):
 class CalibrationFault(Message, frozen=True, kw_only=True):
     """A monitor has detected a calibration fault, or its end; published on every change.
 
-    ``quantity``: "scale" (height or focal length), "mount yaw", "heading", "mirrored picture", "registration" (frames
-    match the map nowhere, for an unknown reason)."""
+    ``quantity``: "scale" (height or focal length), "mount yaw", "heading", "attitude", "aspect ratio", "mirrored
+    picture", "registration" (frames match the map nowhere, for an unknown reason); and of images that are refused since
+    a moment of the flight "picture upside down", "picture turned", "picture mirrored"."""
 
     quantity: str
-    factor: float | None  # scale: reported over true height; angles: reported less true, degrees; None: unknown
+    # scale: reported over true height; aspect ratio: scale of the image's x axis over that of y; angles: reported less
+    # true, degrees; None: unknown
+    factor: float | None
     detail: str  # evidence of the fault
     active: bool
 

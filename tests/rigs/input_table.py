@@ -1,7 +1,6 @@
 """Generates the tables of docs/inputs.md: what is read from outside, in which unit and datum, what is assumed and what
 is refused. Every row names the tests that hold it. Run this file to write the tables into the page."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +21,113 @@ class Row:
     tests: tuple[str, tuple[str, ...]]
 
 
-MAP_INPUTS: tuple[Row, ...] = ()
+MAP_INPUTS: tuple[Row, ...] = (
+    Row(
+        "heights, unit", "unit of the band; else the vertical coordinate system; `--dem-unit`",
+        "any length of PROJ's database, converted to metres; depths become negative", "-",
+        "metres, where file and coordinates say nothing else",
+        "unknown unit; band and vertical system that differ; no unit beside coordinates in feet",
+        ("map/inputs/test_elevation_units.py", (
+            "test_heights_are_converted_from_the_unit_of_the_band",
+            "test_heights_are_converted_from_the_unit_of_the_vertical_system",
+            "test_a_unit_or_datum_that_is_not_known_is_asked_for",
+            "test_a_stated_unit_and_datum_count_and_are_in_the_manifest",
+            "test_every_elevation_of_the_field_has_its_height",
+        )),
+    ),
+    Row(
+        "heights, values", "scale and offset of the band", "(raw x scale + offset) units", "-",
+        "an undeclared void is an implausible height", "a scale of 0, nan",
+        ("map/inputs/test_elevation_units.py", (
+            "test_scale_and_offset_of_the_band_are_applied", "test_feet_with_a_scale_are_both",
+            "test_a_drape_of_a_simulated_flight_converts_feet_too",
+        )),
+    ),
+    Row(
+        "heights, datum", "vertical system, or a coordinate system of three dimensions; `--dem-datum`", "m",
+        "EGM96: ellipsoidal and EGM2008 heights by their grids, national ones by PROJ's operation",
+        "EGM96 where nothing is said; EGM2008 and national heights as they are, where PROJ lacks the grid, which is "
+        "named with the error",
+        "ellipsoidal heights without a grid",
+        ("map/inputs/test_elevation_units.py", (
+            "test_ellipsoidal_heights_of_the_file_are_converted_or_refused",
+            "test_what_is_assumed_of_a_plain_file_is_in_the_manifest_and_in_map_check",
+        )),
+    ),
+    Row(
+        "imagery, datum", "coordinate system of the file", "that of its coordinates",
+        "WGS 84 by the operation that PROJ uses there",
+        "WGS 84 of a datum that is not named on its ellipsoid or GRS 80 (4 m); the shift that a file states itself",
+        "a datum that is not named, or for which PROJ has no operation, on any other ellipsoid",
+        ("map/inputs/test_image_datums.py", (
+            "test_a_datum_that_is_not_named_is_refused", "test_a_shift_of_zero_from_another_ellipsoid_is_no_datum",
+            "test_a_datum_without_a_way_to_wgs84_is_refused",
+            "test_an_ellipsoid_about_the_earths_centre_is_wgs84_with_a_word_and_an_accuracy",
+            "test_a_named_datum_without_a_code_is_that_datum", "test_the_datums_of_the_field",
+        )),
+    ),
+    Row(
+        "imagery, accuracy", "`--ce90`, `ce90_m`; PROJ's accuracy of the operation", "m, radius of 90 %", "-",
+        "no better than the operation; a grid that PROJ lacks is named; the grid must be on the vehicle, too "
+        "(`preflight`)",
+        "-",
+        ("map/inputs/test_image_datums.py", (
+            "test_the_accuracy_is_not_below_what_proj_states_and_a_missing_grid_is_named",
+            "test_an_accuracy_that_is_not_stated_is_that_of_a_datum_worse_than_the_default",
+            "test_a_vehicle_without_the_grid_of_the_build_is_told",
+        )),
+    ),
+    Row(
+        "imagery, place", "geotransform", "-", "-", "-",
+        "ground control points, RPC or arrays of positions alone: the line of gdalwarp is in the message",
+        ("map/inputs/test_image_datums.py", ("test_an_image_without_a_grid_names_the_command_that_makes_one",)),
+    ),
+    Row(
+        "imagery, mask", "alpha; else mask band; else nodata; else the collar on the image's own pixels", "-", "-",
+        "alpha instead of nodata; a nodata value that the pixels cannot hold is ignored",
+        "an image without a valid pixel",
+        ("map/inputs/test_image_masks.py", (
+            "test_alpha_wins_over_nodata", "test_nodata_that_8_bits_cannot_hold_is_ignored_with_a_word",
+            "test_a_collar_is_found_on_every_grid", "test_a_warped_source_of_a_mosaic_has_no_collar_either",
+            "test_the_masks_of_the_field",
+        )),
+    ),
+    Row(
+        "rows of MBTiles", "`tile_row`, bounds, scheme", "tiles", "WGS 84, Web Mercator",
+        "from the north where only so the bounds fit, or the scheme says so without bounds; else from the south; "
+        "bounds that fit neither are named",
+        "rows and zooms that do not exist",
+        ("map/inputs/test_tile_rows.py", (
+            "test_rows_from_either_side_are_read_where_the_bounds_say_which",
+            "test_without_bounds_the_scheme_counts_and_without_both_the_specification",
+            "test_bounds_that_fit_neither_reading_are_named", "test_the_tile_files_of_the_field",
+        )),
+    ),
+    Row(
+        "area", "KML (any encoding, KMZ, gx:Track, DJI's way points), GeoJSON, a box", "degrees", "WGS 84",
+        "points alone are a path in their order; points beside outlines are left out",
+        "decimal commas; a single point",
+        ("map/inputs/test_area_files.py", (
+            "test_a_kml_is_read_in_its_encoding_declared_or_not",
+            "test_spaces_behind_commas_are_read_and_decimal_commas_refused",
+            "test_a_track_and_the_points_of_a_planner_are_paths", "test_an_archive_is_read_by_its_document",
+            "test_every_area_of_the_field_has_its_size_or_is_refused",
+        )),
+    ),
+    Row(
+        "mission, positions", "QGC WPL 110 and 120, plans of all versions of QGroundControl",
+        "degrees, or 1e-7 degrees", "WGS 84",
+        "items without a position are flown where the vehicle is; an unknown command or frame is named once",
+        "positions in metres; a mission without any position",
+        ("map/inputs/test_mission_dialects.py", (
+            "test_every_mission_of_the_field_gives_its_area",
+            "test_a_command_adds_its_position_only_when_it_is_flown_to",
+            "test_an_unknown_command_is_named_once_with_its_items", "test_version_120_has_no_home_row",
+            "test_plans_of_all_versions_of_qgroundcontrol_are_read",
+            "test_positions_in_scaled_integers_are_degrees_and_those_in_metres_are_refused",
+        )),
+    ),
+)  # fmt: skip
 
 FLIGHT_INPUTS: tuple[Row, ...] = (
     Row(
@@ -194,11 +299,8 @@ def table(rows: tuple[Row, ...]) -> str:
 def page(text: str) -> str:
     """The text of the page with all tables generated."""
     for name, rows in TABLES.items():
-        made = table(rows)
-        text, count = re.subn(
-            rf"(<!-- table: {name} -->).*?(<!-- end -->)", lambda m, t=made: f"{m[1]}\n{t}\n{m[2]}", text, flags=re.S
-        )
-        assert count == 1, f"{PAGE}: the marks of the table '{name}' are missing"
+        start, end = text.index(f"<!-- table: {name} -->"), text.index("<!-- end -->", text.index(f"table: {name}"))
+        text = f"{text[:start]}<!-- table: {name} -->\n{table(rows)}\n{text[end:]}"
     return text
 
 

@@ -21,6 +21,8 @@ MAX_UNCONFIRMED_S = DEGRADATION_LEVELS[1][
 MAX_UNANCHORED_S = DEGRADATION_LEVELS[-1][0]  # longest time without a map match later on
 MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejected by the estimator's innovation gate
 # One of map and initial position is wrong; no measurement on board decides which.
+# Faults that begin in flight; all others are of the description, which was wrong from the beginning.
+BEGIN_IN_FLIGHT = ("registration", "picture upside down", "picture turned", "picture mirrored")
 START_CONTRADICTS_MAP = "start and map contradict each other: one of them is in the wrong place"
 MAX_SHOWN_SPANS = 3
 
@@ -145,9 +147,9 @@ def _distrust_reason(row: Row, unconfirmed_until_s: float, faulty_spans: list[tu
 
 def _fault_start_s(alarm_s: float, fault: CalibrationFault, rows: Sequence[Row]) -> float:
     """Returns the time from which a fault applies. A wrong description (camera, heading, height) is wrong from the
-    beginning; a map without matches ("registration") applies since the last match.
+    beginning; a map without matches, or the picture of a camera that came back turned, applies since the last match.
     """
-    if fault.quantity != "registration":
+    if fault.quantity not in BEGIN_IN_FLIGHT:
         return -math.inf
     anchored = [row.t_s for row in rows if row.t_s <= alarm_s and row.anchor_age_ms == 0]
     return max(anchored, default=-math.inf) + 1e-9
@@ -161,4 +163,4 @@ def _rejected_matches(verdict_counts: Mapping[str, int]) -> str:
 
 
 def _fault_name(fault: CalibrationFault) -> str:
-    return fault_text(fault).removesuffix(": no fix")
+    return fault_text(fault).removesuffix(": no fix").removesuffix(": not used")

@@ -231,6 +231,7 @@ def _check_map(package: Path, origin: Origin) -> tuple[Origin, dict[str, Any]]:
             "gsd_m": manifest.gsd_m,
             "date": manifest.date,
             "has_dem": manifest.has_dem,
+            "inputs": [statement.text() for statement in manifest.inputs],
         }
     finally:
         opened.close()

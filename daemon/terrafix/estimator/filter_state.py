@@ -25,6 +25,7 @@ from terrafix.estimator.models.lens_prior import radial_k1_sigma
 from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.estimator.models.speed_prior import SpeedPrior
 from terrafix.estimator.models.terrain import Terrain
+from terrafix.estimator.monitors.image_orientation import OrientationMonitor
 from terrafix.estimator.state import HEIGHT, LOG_HEIGHT_SCALE, MOTION_SIZE, RADIAL_K1, UP, VELOCITY
 from terrafix.messages import Camera, CovarianceMode, LensEstimate, Odometry, Origin
 
@@ -123,6 +124,9 @@ class FilterState:
         self.newest_odometry: Odometry | None = None  # as vision published it
         # Time of the newest implausible odometry, and (2,) by which it was off the prediction, east and north.
         self.image_jump: tuple[float, np.ndarray] | None = None  # None: none since a match
+        # Images have contradicted inertial readings for so long that one of the two is wrong, and no place has decided.
+        self.images_contradicted = False
+        self.orientation = OrientationMonitor()
         self.motion_cov = np.zeros((MOTION_SIZE, MOTION_SIZE))  # of V of the newest node
         self.lens_sigma = radial_k1_sigma(origin.camera)  # of its radial coefficient
         self.node_of: dict[int, int] = {}  # frame -> node, for nodes in the window

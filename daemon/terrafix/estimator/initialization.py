@@ -67,9 +67,12 @@ class ResetReason(StrEnum):
     INDETERMINATE = "the graph was numerically indeterminate"
 
 
-def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior, *, joined: bool = True) -> int:
+def reset(
+    state: FilterState, frame_id: int, t_s: float, prior: GraphPrior, *, joined: bool = True, confirmed: bool = True
+) -> int:
     """A new graph whose only node is the newest frame. -> its node. The nodes before stay as they were estimated.
-    ``joined``: a measurement ties the frame to the flight; False: dead reckoning alone."""
+    ``joined``: a measurement ties the frame to the flight; False: dead reckoning alone. ``confirmed``: its fragment
+    belongs to the flight; False: images that contradict inertial readings may show another."""
     assert state.newest_odometry is not None
     state.keep_keyframes(state.graph.window)
     state.left.clear()  # the new graph may lie elsewhere
@@ -77,7 +80,7 @@ def reset(state: FilterState, frame_id: int, t_s: float, prior: GraphPrior, *, j
     node = state.first_node = state.graph.start(t_s, prior)
     state.covariances.started(node, prior)
     state.continuity = FrameContinuity(KeyframeSubstitution.of(state.newest_odometry))
-    fragment = Fragment(t_s, state.newest_odometry.fragment_id, confirmed=True, joined=joined)
+    fragment = Fragment(t_s, state.newest_odometry.fragment_id, confirmed=confirmed, joined=joined)
     state.register_frame(node, frame_id, fragment)
     return node
 
@@ -120,13 +123,14 @@ def continue_from(
     predicted_cov: np.ndarray,
     *,
     joined: bool,
+    confirmed: bool = True,
 ) -> FrameState:
     """A new graph where the motion model predicts the camera, with the heading that is reported now, or with an
     unobservable one: a vehicle that was not seen may have turned, and the graph would take its course as a measurement
     of the turn.
 
     ``at_m`` (3,), ``velocity`` (8,), ``predicted_cov``: of position and velocity, without what the newest node has.
-    ``joined``: as in ``reset``."""
+    ``joined``, ``confirmed``: as in ``reset``."""
     last, attitude = state.last, frame.attitude
     assert last is not None
     dt_s = frame.t_s - last.t_s
@@ -148,7 +152,7 @@ def continue_from(
     motion_cov[VELOCITY, VELOCITY] += now.sigma_share**2 * float(velocity[:2] @ velocity[:2]) * level
     node = NodeState(gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), at_m), before.calibration, velocity)
     covs = cov, calibration_cov, motion_cov
-    return _start(state, frame, node, covs, state.terrain.elevation_m(at_m), joined=joined)
+    return _start(state, frame, node, covs, state.terrain.elevation_m(at_m), joined=joined, confirmed=confirmed)
 
 
 def _start(
@@ -159,9 +163,11 @@ def _start(
     ground_m: float,
     *,
     joined: bool = True,
+    confirmed: bool = True,
 ) -> FrameState:
     """A new graph with the reported attitude and height. ``covs``: of the pose (6, 6) in world axes, of B (6, 6) and of
-    V (8, 8). ``ground_m``: AMSL, below the camera. ``joined``: as in ``reset``."""
+    V (8, 8). ``ground_m``: AMSL, below the camera. ``joined``, ``confirmed``: as in
+    ``reset``."""
     cov, calibration_cov, motion_cov = covs
     r_w_c = first.pose.rotation().matrix()
     gauge = state.yaw_gauge
@@ -173,7 +179,7 @@ def _start(
         state.camera.factor(state.graph.next_keys(), frame.attitude, r_w_c, ground_m),
         world_to_tangent(cov if gauge is None else gauge.gauge_fixed_cov(cov), r_w_c),
     )
-    reset(state, frame.frame_id, frame.t_s, prior, joined=joined)
+    reset(state, frame.frame_id, frame.t_s, prior, joined=joined, confirmed=confirmed)
     return state.refresh_newest()
 
 

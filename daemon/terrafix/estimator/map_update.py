@@ -26,6 +26,7 @@ from terrafix.estimator.measurements.map_pose import (
     levelled_innovation,
 )
 from terrafix.estimator.models.motion_model import unknown_motion_cov
+from terrafix.estimator.monitors.image_orientation import OrientationMonitor
 from terrafix.estimator.propagation import MOTION_TIMEOUT_S
 from terrafix.estimator.registration import STEP_SHARE
 from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
@@ -195,7 +196,9 @@ class MapUpdate:
     def _accept(self, match: MapMatch, t_s: float, here_m: np.ndarray) -> None:
         state = self._state
         self._fixes.add(t_s, here_m)
-        state.image_jump = None
+        state.image_jump, state.images_contradicted = None, False
+        if not match.position_only:  # its tilt and heading are those of upright images
+            state.orientation = OrientationMonitor()
         state.last_fused_s = max(state.last_fused_s, t_s)
         state.last_fix_s = self._fixes.newest_s
         state.on_placed()

@@ -290,6 +290,7 @@ class EstimatorNode:
         fragment = estimator.state.fragment_of(odometry.frame_id)
         yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict, fragment) for verdict in verdicts)
         no_new_view = odometry.verdict in NO_NEW_VIEW or result.verdict is Verdict.STALLED
+        no_new_view = no_new_view or estimator.state.orientation.refuses  # the anchor would search for it elsewhere
         if not no_new_view and not self._awaits_telemetry(odometry.t_ns, frame.attitude, estimator):
             yield self._prediction(odometry.t_ns, result, estimator, follows=follows)
             self._predicted_id = odometry.frame_id
@@ -299,7 +300,8 @@ class EstimatorNode:
         if self._monitors is not None:
             p = result.placed.pose.translation()
             agl_m = estimator.terrain.height_above_m(p)
-            self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m)
+            orientation = estimator.state.orientation.fault
+            self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:

@@ -77,6 +77,14 @@ class PropagationResult:
         return self.verdict is Verdict.ACCEPTED
 
 
+@dataclass(frozen=True)
+class _RefusedMotion:
+    """Impossible motions in a row: time of the first; ``inertial``: inertial readings contradict all of them."""
+
+    since_s: float
+    inertial: bool
+
+
 class Propagation:
     """``advance`` with every frame, in order of time.
 
@@ -90,7 +98,7 @@ class Propagation:
         self._dead_reckoning = DeadReckoningAid(state)
         self._aids = (self._dead_reckoning, *(make_aid(state) for make_aid in AID_SOURCES))
         self._height_gate, self._heading_gate = InnovationGate("height"), InnovationGate("attitude")
-        self._motion_refused_s: float | None = None  # time of the first of the impossible motions in a row
+        self._motion_refused: _RefusedMotion | None = None
         self._signed = SignedInnovations()  # of odometry that is fused
 
     def advance(self, frame: FrameInput) -> PropagationResult:
@@ -185,13 +193,20 @@ class Propagation:
     ) -> PropagationResult | None:
         """A new graph at the predicted pose, where the present one would be overconfident. None: no reset is due."""
         state, frame, odometry, cov = self._state, predicted.frame, predicted.odometry, predicted.cov.copy()
-        if self._is_motion_timed_out(odometry, frame.t_s) and predicted.increment is not None:
-            dt_s = state.graph.since_newest_s(frame.t_s)
+        self._note_refused_motion(odometry, frame.t_s)
+        if self._is_motion_timed_out(frame.t_s) and predicted.increment is not None:
+            assert self._motion_refused is not None
+            contradicted_s = frame.t_s - self._motion_refused.since_s + state.graph.since_newest_s(frame.t_s)
             cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
-            cov[DELTA_P, DELTA_P] += unknown_motion_cov()[VELOCITY, VELOCITY] * dt_s**2
-            detail = f"odometry contradicts velocity for {MOTION_TIMEOUT_S:.0f} s"
+            cov[DELTA_P, DELTA_P] += unknown_motion_cov()[VELOCITY, VELOCITY] * contradicted_s**2
+            against = "inertial readings" if self._motion_refused.inertial else "velocity"
+            detail = f"odometry contradicts {against} for {MOTION_TIMEOUT_S:.0f} s"
             reset = _reset_verdict(ResetReason.MOTION_TIMEOUT, detail)
-            return self._continue(replace(predicted, cov=cov), [*verdicts, reset])
+            state.images_contradicted = self._motion_refused.inertial
+            self._motion_refused = None  # velocity is unknown from here on: the next one has its own time
+            return self._continue(
+                replace(predicted, cov=cov), [*verdicts, reset], confirmed=not state.images_contradicted
+            )
         if self._is_velocity_wrong(odometry) and predicted.increment is not None:
             off_m, self._signed = self._signed.sum_m, SignedInnovations()
             cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
@@ -224,12 +239,21 @@ class Propagation:
             self._state.yaw_gauge = gauge.after_odometry()
         return None
 
-    def _continue(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
+    def _continue(
+        self, predicted: PredictedFrame, verdicts: list[FusionVerdict], *, confirmed: bool = True
+    ) -> PropagationResult:
+        """``confirmed``: as in ``reset``."""
         odometry = predicted.odometry
         joined = odometry.fused is not None and odometry.fragment.joined
         step_m = predicted.step_m
         placed = continue_from(
-            self._state, predicted.frame, predicted.p_m, predicted.motion, predicted.cov, joined=joined
+            self._state,
+            predicted.frame,
+            predicted.p_m,
+            predicted.motion,
+            predicted.cov,
+            joined=joined,
+            confirmed=confirmed,
         )
         sigma_m = worst_sigma(predicted.cov[:2, :2])
         return PropagationResult(odometry.verdict, placed, step_m, sigma_m, verdicts=tuple(verdicts))
@@ -390,16 +414,22 @@ class Propagation:
         self._signed.add(innovation.residual_m[HORIZONTAL], innovation.cov_m2[HORIZONTAL, HORIZONTAL])
         return self._signed.alarm
 
-    def _is_motion_timed_out(self, odometry: GatedOdometry, t_s: float) -> bool:
-        """Whether impossible motions have gone on for so long that velocity may be what is wrong."""
+    def _note_refused_motion(self, odometry: GatedOdometry, t_s: float) -> None:
+        innovation = odometry.motion_innovation
         if odometry.verdict is not Verdict.IMPLAUSIBLE:
-            self._motion_refused_s = None
-            return False
-        self._motion_refused_s = t_s if self._motion_refused_s is None else self._motion_refused_s
-        if t_s - self._motion_refused_s < MOTION_TIMEOUT_S:
-            return False
-        self._motion_refused_s = None  # velocity is unknown from here on: the next one has its own time
-        return True
+            self._motion_refused = None
+        elif self._motion_refused is None:
+            self._motion_refused = _RefusedMotion(t_s, innovation is not None and innovation.inertial)
+        elif innovation is not None and not innovation.inertial:
+            self._motion_refused = replace(self._motion_refused, inertial=False)
+
+    def _is_motion_timed_out(self, t_s: float) -> bool:
+        """Whether impossible motions have gone on for so long that velocity may be what is wrong; not while turned or
+        mirrored images explain them."""
+        refused = self._motion_refused
+        return (
+            refused is not None and t_s - refused.since_s >= MOTION_TIMEOUT_S and not self._state.orientation.suspects
+        )
 
     # --- dead reckoning of the autopilot ---------------------------------------------------------------------------
 

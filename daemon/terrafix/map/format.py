@@ -72,7 +72,8 @@ class Ce90Origin(StrEnum):
 
     STATED = "stated"  # by the producer of the imagery
     ESTIMATED = "estimated"  # at build time, against another layer of the package
-    DEFAULT = "default"  # neither is known: `[map] ce90_m` is used
+    DATUM = "datum"  # not stated, and the way from the datum of the imagery to WGS 84 is no better than this
+    DEFAULT = "default"  # nothing is known: `[map] ce90_m` is used
 
 
 class Layer(msgspec.Struct, frozen=True, kw_only=True):
@@ -134,6 +135,22 @@ class VectorTable(msgspec.Struct, frozen=True, kw_only=True):
     licence: str
 
 
+class InputStatement(msgspec.Struct, frozen=True, kw_only=True):
+    """What an input of the build was taken for."""
+
+    name: str  # file name or title
+    kind: str  # imagery, elevation
+    unit: str  # of the heights of elevation; of the coordinates of imagery
+    datum: str  # of the heights; of the coordinates
+    accuracy_m: float | None  # of the way from its datum to WGS 84, as PROJ states it; None: not stated
+    assumed: tuple[str, ...] = ()  # what it does not state itself, or what was done with it
+
+    def text(self) -> str:
+        """One line."""
+        accuracy = "" if self.accuracy_m is None else f", {self.accuracy_m:g} m to WGS 84"
+        return "; ".join((f"{self.kind} {self.name}: {self.datum}, {self.unit}{accuracy}", *self.assumed))
+
+
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     """Metadata of the package; stored as one row per field in the table terrafix_manifest.
 
@@ -156,6 +173,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     ce90_m: float | None = None
     layers: tuple[Layer, ...] = ()  # imagery, newest first; then the drawn layer
     vectors: tuple[VectorTable, ...] = ()
+    inputs: tuple[InputStatement, ...] = ()  # empty: the package predates this field
     sealed: bool = False  # whether the file contains a file digest (``checksum.py``)
 
 

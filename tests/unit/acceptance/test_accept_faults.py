@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import rasterio
@@ -21,7 +22,7 @@ from terrafix_lab.accept.plan import Plan
 from terrafix_lab.accept.scenarios import BY_NAME
 from terrafix_lab.faults import edits, pictures
 from terrafix_lab.faults.edits import Span
-from terrafix_lab.faults.nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_lab.faults.messages import AlteredAnchor, HotComputer, outliers
 from terrafix_lab.faults.source import AlteredSource
 from terrafix_tools.evaluate import Truth
 
@@ -142,15 +143,12 @@ class Saying:
 
 def test_a_wrong_fix_is_350_m_away_with_a_small_covariance() -> None:
     published = MapMatch(t_ns=0, frame_id=1, verdict=Verdict.AMBIGUOUS, matcher="gradient")
-    anchor = WrongFixes(Saying(published), frozenset({"1.jpg"}), seed=0)
-    names = FrameNames(Saying(), anchor)
+    anchor = AlteredAnchor(Saying(published), outliers())
     prediction = Prediction(
         t_ns=0, frame_id=1, p_c_in_w_m=(10.0, 20.0, 100.0), q_w_c=(1.0, 0.0, 0.0, 0.0), cov=(0.0,) * 36, agl_m=100.0,
         agl_sigma_m=1.0, step_m=(0.0, 0.0), step_cov_m2=(0.0,) * 4)  # fmt: skip
-    names.on(Frame(t_ns=0, frame_id=0, file="0.jpg", width=8, height=4))
     assert list(anchor.on(prediction)) == [published]
-    names.on(Frame(t_ns=0, frame_id=1, file="1.jpg", width=8, height=4))
-    (wrong,) = anchor.on(prediction)
+    (wrong,) = anchor.on(msgspec.structs.replace(prediction, frame_id=15))
     assert isinstance(wrong, MapMatch) and wrong.verdict is Verdict.ACCEPTED and wrong.pose is not None
     assert np.hypot(wrong.pose.p_c_in_w_m[0] - 10.0, wrong.pose.p_c_in_w_m[1] - 20.0) == pytest.approx(350.0)
 

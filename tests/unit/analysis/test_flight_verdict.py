@@ -113,6 +113,15 @@ def test_a_registration_fault_applies_from_the_last_match_on() -> None:
     assert verdict.active_faults == ["the map is found nowhere"]
 
 
+@pytest.mark.parametrize("quantity", ["picture upside down", "picture turned", "picture mirrored"])
+def test_a_picture_that_turned_in_flight_leaves_the_flight_before_it_trusted(quantity: str) -> None:
+    flown = rows()
+    for row in flown[31:]:
+        row.anchor_age_ms = 1000
+    verdict = flight_verdict(flown, [(33.0, fault(quantity))])
+    assert verdict.spans == [(0.0, 30.0)] and verdict.active_faults == [quantity]
+
+
 def test_a_flight_that_rejects_most_map_matches_is_not_trusted() -> None:
     assert flight_verdict(rows(), (), {"map": {"accepted": 4, "innovation": 5}}).label == "do not trust it"
     assert flight_verdict(rows(), (), {"map": {"accepted": 5, "innovation": 5}}).label == "trust it"

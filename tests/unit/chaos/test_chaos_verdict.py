@@ -1,6 +1,8 @@
 """Judgement of a cell of the fault matrix, its table, and the damage that its camera does."""
 
 import time
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,13 +10,14 @@ import numpy as np
 import pytest
 
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix_lab.chaos import verdict
+from terrafix_lab.chaos import run, verdict
 from terrafix_lab.chaos.camera import StreamedCamera
+from terrafix_lab.chaos.rig import Rig
 from terrafix_lab.chaos.run import Results
-from terrafix_lab.chaos.scene import AGL_M, phases
+from terrafix_lab.chaos.scene import AGL_M, Scene, phases
 from terrafix_lab.chaos.table import table, write_table
 from terrafix_lab.chaos.verdict import Outcome
-from terrafix_lab.faults.edits import Span
+from terrafix_lab.faults.edits import Edit, Span, unchanged, unchanged_origin
 from terrafix_lab.faults.fault import CAMPAIGNS, Phase, check_flown_by, lacking
 from terrafix_lab.faults.table import FAULTS, MATRIX
 from terrafix_lab.sim.autopilot.course import PeerState
@@ -219,7 +222,7 @@ def sent(name: str) -> list[tuple[bytes, int]]:
         Recorded() as stream,
         StreamedCamera(stream, lambda _t_s: jpeg(), lambda: time.monotonic() - began_s, 10.0) as camera,
     ):
-        camera.edit = FAULTS[name].edit(Span(0.0, 1e9, name))
+        camera.edit = FAULTS[name].of_camera(Span(0.0, 1e9, name))
         time.sleep(0.15)
         stream.pushed.clear()
         time.sleep(0.5)
@@ -235,3 +238,57 @@ def test_a_campaign_that_lacks_what_a_fault_needs_says_so_and_names_one_that_has
         able = [command for command in CAMPAIGNS if not lacking(command, fault)]
         assert able, f"nothing can fly '{fault.name}'"
         assert fault.process is None or able == ["terrafix chaos --fault"]
+
+
+class HeldInTheAir:
+    """The part of the rig that a cell uses, with a fix 2 m off each 0.1 s."""
+
+    def __init__(self) -> None:
+        self.began_s, self.scene = time.monotonic() - 10.0, Scene(Path(), [], copter, {}, 0.0)
+        self.camera, self.peer, self.edits = self, self, list[tuple[str, str]]()
+        self.received_s: list[float] = []
+        self.pushed_s = [self.began_s + 0.5 * k for k in range(100)]
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name == "edit":
+            self.edits.append(("camera", "true" if value is unchanged else "edited"))
+        object.__setattr__(self, name, value)
+
+    def edit_telemetry(self, edit: Edit) -> None:
+        self.edits.append(("telemetry", "true" if edit is unchanged else "edited"))
+
+    def take_off(self) -> None: ...
+
+    def check(self) -> None: ...
+
+    def fixes(self) -> list[ReceivedFix]:
+        count = round(10.0 * (time.monotonic() - self.began_s))
+        return [ReceivedFix(self.began_s + 0.1 * k, 2.0, 1.5) for k in range(count)]
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize(("name", "hit"), [("camera: frozen", "camera"), ("forged heading", "telemetry")])
+def test_a_cell_hands_each_part_of_a_fault_to_its_own_and_takes_it_back(
+    name: str, hit: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "STEADY_S", 0.6)
+    rig, fault = HeldInTheAir(), replace(FAULTS[name], lasts_s=0.3)
+    outcome = run._fly(rig, fault, Phase.CRUISE, 0.5)  # type: ignore[arg-type]
+    assert (hit, "edited") in rig.edits and [e for e in rig.edits if e[1] == "edited"] == [(hit, "edited")]
+    assert rig.edits[-2:] == [("camera", "true"), ("telemetry", "true")]
+    assert outcome.fixes > 90 and outcome.wrong == 0 and outcome.back_s == 0.0
+    assert outcome.criteria["late sure over 20 m"] == "0" and outcome.criteria["right again"].endswith("s")
+
+
+def test_a_false_start_and_camera_are_in_the_configuration_that_the_processes_read(tmp_path: Path) -> None:
+    (tmp_path / "map").write_bytes(b"map")
+    scene = Scene(tmp_path / "map", [], copter, {}, 0.0)
+    for name, has_start, focal in (("focal length doubled", True, 2.0), ("start unknown", False, 1.0)):
+        rig = Rig(scene, tmp_path / name, 60.0, seed=1, origin=FAULTS[name].origin or unchanged_origin)
+        try:
+            rig._write_config(14550)
+        finally:
+            rig.stream.close()
+        found = tomllib.loads((tmp_path / name / "terrafix.toml").read_text())
+        camera = tomllib.loads((tmp_path / name / "camera.toml").read_text())["camera"]
+        assert ("start" in found["source"]) == has_start and camera["fx"] == focal * scene.camera.fx

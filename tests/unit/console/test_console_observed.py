@@ -117,6 +117,23 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
     ]
 
 
+def test_a_flight_that_is_lost_when_its_images_are_through_asks_once() -> None:
+    flight = Flight()
+    for step in (WIDEN, WHOLE):
+        flight.frame(LOST, step)
+        assert flight.observer.images_through() is None  # two frames are no lost flight
+    flight.frame(LOST, WHOLE)
+    asked = flight.observer.images_through()
+    assert asked is not None and asked.state is FlightState.BLOCKED and asked.request is not None
+    kinds = [type(event).__name__ for event in asked.events]
+    assert kinds == ["UserInputNeeded", "ProcessingBlocked", "StateChanged"]
+    assert "all images are computed" in str(asked.events[1])
+    assert flight.observer.images_through() is None
+    found = flight.frame(m.Verdict.ACCEPTED, m.SearchStep.MERGE)
+    assert found.state is FlightState.PROCESSING and found.request is None
+    assert flight.observer.images_through() is None
+
+
 def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> None:
     flight = Flight()
     flight.frame(LOST, ASK)

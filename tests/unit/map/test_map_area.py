@@ -186,7 +186,7 @@ REFUSED = {
     "flat.geojson": ('{"type": "Polygon", "coordinates": [[1, 2, 3]]}', "no list of"),
     "topo.geojson": ('{"type": "Topology", "coordinates": []}', "is not an area"),
     "plan.json": ('{"fileType": "Plan"}', "name it .plan"),
-    "zip.kmz": ("", "unzip it"),
+    "zip.kmz": ("", "not valid XML"),
     "area.shp": ("", "give a box W,S,E,N"),
 }
 

@@ -223,6 +223,18 @@ def test_ensure_package_builds_once_and_returns_existing_packages(tmp_path: Path
     MapPackage.open(again, verify=True).close()
 
 
+def test_a_cached_package_that_does_not_say_what_was_read_is_built_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tif = map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300))
+    with monkeypatch.context() as before:
+        before.setattr("terrafix_tools.mapping.build.merged", lambda *_: [])  # as earlier versions built it
+        old = ensure_package(tif, tmp_path / "cache")
+        assert not MapPackage.open(old).manifest.inputs
+    again = ensure_package(tif, tmp_path / "cache")
+    assert again == old and MapPackage.open(again).manifest.inputs
+
+
 def broken(tmp_path: Path, what: str) -> Path:
     rgb = map_rasters.texture(64, 64)
     path = tmp_path / "broken.tif"

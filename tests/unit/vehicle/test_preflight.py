@@ -612,6 +612,16 @@ def test_start_and_mission_must_lie_on_the_map(tmp_path: Path, small_map: Path) 
     assert "sign" in f"{unsigned['map'].text} {unsigned['map'].fix}"
 
 
+def test_a_command_that_is_not_known_is_named_by_preflight(tmp_path: Path, small_map: Path) -> None:
+    centre = centre_of(small_map)
+    lat, lon = centre.lat_deg, centre.lon_deg
+    rows = [f"0 1 0 16 0 0 0 0 {lat} {lon} 0 1", f"1 0 3 82 0 0 0 0 {lat} {lon} 60 1", "2 0 3 62000 0 0 0 0 1 2 3 1"]
+    mission = tmp_path / "m.waypoints"
+    mission.write_text("\n".join(["QGC WPL 110", *rows]))
+    line = computer_lines(Config(map=MapSection(path=str(small_map))), mission, tmp_path)["mission"]
+    assert (line.status, line.text) == ("warn", "MAVLink command 62000 is not known: item 2")
+
+
 def test_a_missing_map_is_a_failure_with_a_fix(tmp_path: Path) -> None:
     config = Config(map=MapSection(path=str(tmp_path / "none.gpkg")))
     lines = computer_lines(config, None, tmp_path)

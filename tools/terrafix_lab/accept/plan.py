@@ -1,16 +1,18 @@
 """Definition of a scenario: name, requirement, rows, and the edits that turn a flight into it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from terrafix.core.node import Node, NodeContext
 from terrafix_lab.accept.flight import Flight
 from terrafix_lab.accept.measuring.criteria import PERMANENT, SCARCE, TEMPORARY, WITH_SPAN
 from terrafix_lab.accept.measuring.results import Marks
 from terrafix_lab.faults.edits import Edit, OriginEdit, unchanged, unchanged_origin
 from terrafix_lab.faults.fault import START, Fault
+from terrafix_lab.faults.messages import AlteredAnchor
 from terrafix_lab.sim.flights.folder import FRAME_HZ
 from terrafix_tools.replay import MakeNodes, make_nodes
 
@@ -47,7 +49,19 @@ def plan_of(fault: Fault, flight: Flight) -> Plan | str:
     span = fault.span(refs[0].t_s, refs[-1].t_s, refs[flight.at(START)].t_s)
     is_marked = fault.lasts_s is not None or not fault.is_true
     marks = Marks(spans=(span,) if is_marked else (), lie=None if fault.is_true else span)
-    return Plan(fault.edit(span), fault.origin or unchanged_origin, marks=marks)
+    return Plan(fault.edit(span), fault.origin or unchanged_origin, _nodes_of(fault), marks=marks)
+
+
+def _nodes_of(fault: Fault) -> MakeNodes:
+    if fault.matches is None:
+        return make_nodes
+    edit = fault.matches()
+
+    def nodes(ctx: NodeContext) -> Mapping[str, Node]:
+        made = make_nodes(ctx)
+        return {**made, "anchor": AlteredAnchor(made["anchor"], edit)}
+
+    return nodes
 
 
 @dataclass(frozen=True)

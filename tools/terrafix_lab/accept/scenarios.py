@@ -1,6 +1,7 @@
 """The named scenarios: ground, fault, requirement. Described in docs/acceptance.md."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,11 @@ from terrafix_lab.accept.false_inputs.scenarios import LIES
 from terrafix_lab.accept.flight import Flight
 from terrafix_lab.accept.measuring.criteria import EVERYWHERE, WITH_SPAN
 from terrafix_lab.accept.measuring.results import Marks
-from terrafix_lab.accept.plan import CLOSED_LOOP, FRAMES, Plan, Scenario, scenario_of, without_fault
+from terrafix_lab.accept.plan import CLOSED_LOOP, FRAMES, Plan, Scenario, plan_of, scenario_of, without_fault
 from terrafix_lab.faults import edits, pictures
 from terrafix_lab.faults.edits import Span
 from terrafix_lab.faults.fault import lacking
-from terrafix_lab.faults.nodes import FrameNames, HotComputer, WrongFixes
+from terrafix_lab.faults.messages import OUTLIER_EVERY, HotComputer
 from terrafix_lab.faults.table import FAULTS, IMPRECISE_INPUTS
 from terrafix_tools.replay import make_nodes
 
@@ -28,7 +29,6 @@ UNMATCHABLE, UNMATCHABLE_WITHIN = 0.20, (0.10, 0.90)  # shares of the frames: a 
 UNMATCHABLE_STEP = 0.05
 HOT = (1 / 3, 2 / 3)
 LONG_FRAMES = 1500
-OUTLIER_EVERY = 10  # up to 10 % wrong map matches are tolerated (AC-5)
 KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the opposite: 990 m, with a stated sigma of tens of metres
 
 
@@ -57,15 +57,10 @@ def _foreign(shown: dict[str, Image]) -> Plan:
     )
 
 
-def _outlier_fix(flight: Flight) -> Plan:
+def _outlier_fix(flight: Flight) -> Plan | str:
+    plan = plan_of(FAULTS["350 m outlier fix"], flight)
     wrong = frozenset(s.file for s in flight.frame_refs[OUTLIER_EVERY // 2 :: OUTLIER_EVERY])
-
-    def nodes(ctx: NodeContext) -> Mapping[str, Node]:
-        made = make_nodes(ctx)
-        anchor = WrongFixes(made["anchor"], wrong, seed=1)
-        return made | {"anchor": anchor, "vision": FrameNames(made["vision"], anchor)}
-
-    return Plan(nodes=nodes, marks=Marks(wrong_files=wrong))
+    return plan if isinstance(plan, str) else replace(plan, marks=Marks(wrong_files=wrong))
 
 
 def _gap(flight: Flight, low: int, high: int, turning: bool) -> tuple[int, int] | str:
@@ -201,7 +196,7 @@ SCENARIOS: tuple[Scenario, ...] = (
         "350 m frame", "Three frames are repeated 350 m from their place: rejected, and the next one is correct.",
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _far_frame),
     Scenario(
-        "350 m outlier fix", "Every tenth map fix has an error of 350 m and a small covariance: it is rejected.",
+        "350 m outlier fix", FAULTS["350 m outlier fix"].words,
         (*EVERYWHERE, "wrong ones rejected", "next frame"), _outlier_fix),
     Scenario(
         "sharp turn", "Frames are missing where the track turns most, without overlap: a new fragment.",

@@ -7,9 +7,8 @@ of them together are killed (SIGKILL) in turn, N times; a link that is stopped (
 comes when there was a fix for STEADY_S. Exit code 1: of a row, the median is above MEDIAN_S or the worst above WORST_S,
 or a position was wrong (chaos/verdict.py)."""
 
-import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -20,12 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.core.errors import UsageError
-from terrafix.processes import PROCESSES
 from terrafix_lab.bench.result_file import write_result
 from terrafix_lab.chaos.rig import Rig
 from terrafix_lab.chaos.scene import Scene
 from terrafix_lab.chaos.shuttle import RUN, shuttle_in
 from terrafix_lab.chaos.verdict import back_s, sigmas, without_fix_s, wrong_fixes
+from terrafix_lab.faults.fault import Action, nothing
+from terrafix_lab.faults.processes import NAMES
+from terrafix_lab.faults.table import FAULTS
 from terrafix_lab.standalone import run_standalone
 from terrafix_tools.score import longest_gap_s
 
@@ -35,12 +36,18 @@ MEDIAN_S, WORST_S = 2.0, 4.0  # [spec: hot restart, median and worst of 50]
 STEP_S = 0.02
 MISSED = 1  # exit code
 
-KILLS: dict[str, Callable[[Rig], None]] = {
-    "supervisor": lambda rig: rig.signal("supervisor", signal.SIGKILL),
-    **{p.name: lambda rig, name=p.name: rig.signal(name, signal.SIGKILL) for p in PROCESSES},  # type: ignore[misc]
-    "link stopped": lambda rig: rig.signal("link", signal.SIGSTOP),
-    "nothing": lambda _rig: None,  # gaps of the flight itself
-    "all": lambda rig: rig.kill_all(),
+
+def begin_of(fault: str) -> Action:
+    process = FAULTS[fault].process
+    assert process is not None
+    return process.begin
+
+
+KILLS: dict[str, Action] = {
+    **{name: begin_of(f"{name}: kill -9") for name in NAMES},
+    "link stopped": begin_of("link: SIGSTOP"),
+    "nothing": nothing,  # gaps of the flight itself
+    "all": begin_of("all processes: kill -9"),
 }
 
 

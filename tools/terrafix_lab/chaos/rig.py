@@ -19,7 +19,7 @@ from terrafix_lab.chaos.memory_group import MemoryGroup
 from terrafix_lab.chaos.scene import Scene
 from terrafix_lab.chaos.serial_line import SerialLine
 from terrafix_lab.chaos.switches import Switches
-from terrafix_lab.faults.edits import Edit, OriginEdit, unchanged, unchanged_origin
+from terrafix_lab.faults.edits import OriginEdit, unchanged_origin
 from terrafix_lab.faults.fault import Need
 from terrafix_lab.faults.processes import COOL_MC, SUPERVISOR
 from terrafix_lab.sim.autopilot.course import PeerState
@@ -114,11 +114,6 @@ class Rig:
         if Need.CONSOLE in self._needs:
             self.console = Console(next(self.run_folders()), self.folder)
         self.began_s = time.monotonic()
-
-    def edit_inputs(self, edit: Edit) -> None:
-        """Of camera and autopilot, from now on."""
-        self.camera.edit = edit
-        self.peer.edit_telemetry(None if edit is unchanged else edit)
 
     def flight_s(self) -> float:
         """Second of the flight."""

@@ -95,10 +95,12 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
     lasts_s = WHOLE_S if fault.lasts_s is None else fault.lasts_s
     span = Span(fault_s, fault_s + lasts_s, fault.name)
     if fault.source is not None:
-        rig.edit_inputs(fault.edit(span))
+        rig.camera.edit = fault.of_camera(span)
+    rig.peer.edit_telemetry(fault.of_telemetry(span))
     process.begin(rig)
     _wait(rig, fault_s + lasts_s, lambda: process.during(rig, time.monotonic() - fault_s))
-    rig.edit_inputs(unchanged)
+    rig.camera.edit = unchanged
+    rig.peer.edit_telemetry(unchanged)
     process.end(rig)
     ended_s = time.monotonic()
     _wait_for_fix(rig, ended_s)

@@ -17,6 +17,7 @@ WRONG_SIGMAS = 4.0
 STEADY_S = 1.0  # a fix is back when none of the GPS_INPUT of this long afterwards lacks one
 MATCH_S = 0.15  # a recorded GPS_INPUT within this time of a received one is that one: its period is 0.1 s
 WITHOUT_FIX_S = 0.35  # between two 3D fixes, from which on there was no fix: more than three periods
+NOTHING_M = 1e-6  # the claim of a fix that states none: any error is beyond it
 NO_FIX = "no fix before the fault"  # the flight itself failed, on a busy computer; the cell is flown again
 RECORD_LIMIT_S = 1.5  # a kill or a power cut loses at most 1.25 s by the promise of the recorder, and a period
 
@@ -42,7 +43,9 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 
 def track_of(fixes: Sequence[ReceivedFix], fault: Span | None, frames_s: Sequence[float]) -> Track:
     """Of the 3D fixes; the claim is that of the worst axis. ``frames_s``: times of the images."""
-    t_s, error_m, sigma_m = np.array([(f.received_s, f.error_m, f.horizontal_m) for f in fixes]).reshape(-1, 3).T
+    t_s, error_m, sigma_m = (
+        np.array([(f.received_s, f.error_m, f.horizontal_m or NOTHING_M) for f in fixes]).reshape(-1, 3).T
+    )
     return Track(t_s, error_m, (error_m / sigma_m) ** 2, sigma_m, fault, frames_s)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from terrafix.core.errors import UsageError
 from terrafix_lab.faults.edits import EVER, Edit, OriginEdit, Span, unchanged
+from terrafix_lab.faults.messages import MatchEdit
 
 if TYPE_CHECKING:
     from terrafix_lab.chaos.rig import Rig
@@ -28,6 +29,7 @@ class Need(StrEnum):
     """What a fault needs beside frames, telemetry and a map. ROOT: only root can mount it."""
 
     PROCESSES = "the real processes"
+    MATCHES = "map matches as messages between nodes in one process"
     LIVE = "a live camera"
     PIXELS = "images"
     SEARCH = "a search over the map"
@@ -61,25 +63,36 @@ class Process:
 
 @dataclass(frozen=True)
 class Fault:
-    """One row of the table. ``lasts_s`` None: from the first frame to the last. ``source``: the edit of the shots in a
-    span. ``origin``: an edit of start and camera, for the whole flight. ``is_true``: no input is false, some are
-    missing. ``no_fix_in``: phases of the fault matrix in which no fix is expected after it."""
+    """One row of the table. ``lasts_s`` None: from the first frame to the last. ``source``: the edit of frames in a
+    span; ``telemetry``: of what the autopilot reports, one shot for each. ``origin``: an edit of start and camera, for
+    the whole flight. ``matches``: makes an edit of the map matches. ``is_true``: no input is false, some are missing.
+    ``no_fix_in``: phases of the fault matrix in which no fix is expected after it."""
 
     name: str
     words: str = ""
     lasts_s: float | None = None
     source: Callable[[Span], Edit] | None = None
+    telemetry: Callable[[Span], Edit] | None = None
     origin: OriginEdit | None = None
+    matches: Callable[[], MatchEdit] | None = None
     process: Process | None = None
     needs: frozenset[Need] = frozenset()
     is_true: bool = False
     no_fix_in: frozenset[Phase] = frozenset({Phase.LANDING})  # it ends below the least height for matching
 
+    def of_camera(self, span: Span) -> Edit:
+        return self._edit(self.source, span)
+
+    def of_telemetry(self, span: Span) -> Edit:
+        return self._edit(self.telemetry, span)
+
     def edit(self, span: Span) -> Edit:
-        """Of the source; the fault of a whole flight hits also what comes before the first frame."""
-        if self.source is None:
-            return unchanged
-        return self.source(EVER if self.lasts_s is None else span)
+        """Of camera and telemetry."""
+        return lambda shots: self.of_telemetry(span)(self.of_camera(span)(shots))
+
+    def _edit(self, part: Callable[[Span], Edit] | None, span: Span) -> Edit:
+        """The fault of a whole flight hits also what comes before the first frame."""
+        return unchanged if part is None else part(EVER if self.lasts_s is None else span)
 
     @property
     def flight_s(self) -> float:
@@ -96,15 +109,16 @@ class Fault:
 
 
 CAMPAIGNS = {  # command -> what its driver has
-    "terrafix accept --scenario": frozenset({Need.PIXELS, Need.SEARCH, Need.UNKNOWN}),
-    "terrafix montecarlo --fault": frozenset({Need.UNKNOWN}),
-    "terrafix chaos --fault": frozenset(Need) - {Need.UNKNOWN},
+    "terrafix accept --scenario": frozenset({Need.MATCHES, Need.PIXELS, Need.SEARCH, Need.UNKNOWN}),
+    "terrafix montecarlo --fault": frozenset({Need.MATCHES, Need.UNKNOWN}),
+    "terrafix chaos --fault": frozenset(Need) - {Need.MATCHES, Need.UNKNOWN},
 }
 
 
 def lacking(command: str, fault: Fault) -> list[Need]:
     """What a fault needs that ``command``, a key of CAMPAIGNS, has not."""
-    needed = fault.needs | ({Need.PROCESSES} if fault.process is not None else set())
+    of_parts = {Need.PROCESSES: fault.process, Need.MATCHES: fault.matches}
+    needed = fault.needs | {need for need, part in of_parts.items() if part is not None}
     return sorted(needed - CAMPAIGNS[command])
 
 

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +17,7 @@ import numpy as np
 from terrafix.processes import PROCESSES
 from terrafix_lab.chaos.console import ASKING_CLIENTS, EVENT_CLIENTS, Console
 from terrafix_lab.chaos.switches import Switch
-from terrafix_lab.faults.fault import Action, Fault, Need, Phase, Process
+from terrafix_lab.faults.fault import Action, Fault, Need, Phase, Process, nothing
 
 if TYPE_CHECKING:
     from terrafix_lab.chaos.rig import Rig
@@ -31,19 +33,24 @@ LEAKED_BYTES = 128 << 20  # after which the kernel ends a process that leaks
 JUMP_S = 86_400.0 * 365  # of the wall clock: as after an empty battery of the clock
 SLOW_FSYNC_S = 3.0
 SECOND_SYSID = 42
-DISK = frozenset({Need.DISK})
+
+
+def act(name: str, lasts_s: float, begin: Action = nothing, end: Action = nothing, *needs: Need) -> Fault:
+    return Fault(name, lasts_s=lasts_s, process=Process(begin, end), needs=frozenset(needs))
 
 
 def killed(process: str) -> Fault:
-    return Fault(f"{process}: kill -9", lasts_s=0.0, process=Process(lambda rig: rig.signal(process, signal.SIGKILL)))
+    return act(f"{process}: kill -9", 0.0, lambda rig: rig.signal(process, signal.SIGKILL))
 
 
 def stopped(process: str, lasts_s: float) -> Fault:
     """A process that was stopped for longer than its limit has been replaced when the fault ends."""
-    stop = Process(
-        begin=lambda rig: rig.signal(process, signal.SIGSTOP), end=lambda rig: rig.signal(process, signal.SIGCONT)
-    )
-    return Fault(f"{process}: SIGSTOP", lasts_s=lasts_s, process=stop)
+    stop, go = (partial(_signal, process, number) for number in (signal.SIGSTOP, signal.SIGCONT))
+    return act(f"{process}: SIGSTOP", lasts_s, stop, go)
+
+
+def _signal(process: str, number: signal.Signals, rig: "Rig") -> None:
+    rig.signal(process, number)
 
 
 def slow(process: str) -> Fault:
@@ -65,8 +72,7 @@ def limited(process: str, what: str, limit: int, used: Callable[[int], int]) -> 
                 hard = resource.prlimit(pid, limit)[1]
                 resource.prlimit(pid, limit, (hard if lifted else used(pid), hard))
 
-    limits = Process(lambda rig: set_limit(rig, lifted=False), lambda rig: set_limit(rig, lifted=True))
-    return Fault(f"{process}: {what}", lasts_s=SHORT_S, process=limits)
+    return act(f"{process}: {what}", SHORT_S, partial(set_limit, lifted=False), partial(set_limit, lifted=True))
 
 
 def _memory(pid: int) -> int:
@@ -91,8 +97,7 @@ def leaking(process: str) -> Fault:
         rig.switches.set(Switch.LEAK_PID, 0.0)
         rig.memory_group.lift()
 
-    needs = frozenset({Need.SWITCHES, Need.MEMORY_GROUP})
-    return Fault(f"{process}: leak", lasts_s=SHORT_S, process=Process(begin, end), needs=needs)
+    return act(f"{process}: leak", SHORT_S, begin, end, Need.SWITCHES, Need.MEMORY_GROUP)
 
 
 def _mute(rig: "Rig", *, muted: bool) -> None:
@@ -103,8 +108,8 @@ def _noise(rig: "Rig", elapsed_s: float) -> None:
     rig.peer.inject(np.random.default_rng(round(1000 * elapsed_s)).bytes(200))
 
 
-def _mount(out: Path, *options: str) -> None:
-    subprocess.run(["mount", *options, str(out)], check=False, capture_output=True)
+def _remount(rig: "Rig", how: str) -> None:
+    subprocess.run(["mount", "-o", f"remount,{how}", str(rig.out)], check=False, capture_output=True)
 
 
 def _fill(rig: "Rig") -> None:
@@ -134,17 +139,16 @@ def _other_baud(rig: "Rig", *, other: bool) -> None:
 
 
 def switched(name: str, switch: Switch, value: float, *needs: Need) -> Fault:
-    switched_on = Process(lambda rig: rig.switches.set(switch, value), lambda rig: rig.switches.set(switch, 0.0))
-    return Fault(name, lasts_s=SHORT_S, process=switched_on, needs=frozenset({Need.SWITCHES, *needs}))
+    on, off = lambda rig: rig.switches.set(switch, value), lambda rig: rig.switches.set(switch, 0.0)
+    return act(name, SHORT_S, on, off, Need.SWITCHES, *needs)
 
 
 def console(name: str, lasts_s: float, begin: Callable[[Console], None], end: Callable[[Console], None]) -> Fault:
-    def act(rig: "Rig", action: Callable[[Console], None]) -> None:
+    def of(action: Callable[[Console], None], rig: "Rig") -> None:
         assert rig.console is not None
         action(rig.console)
 
-    acts = Process(lambda rig: act(rig, begin), lambda rig: act(rig, end))
-    return Fault(f"console: {name}", lasts_s=lasts_s, process=acts, needs=frozenset({Need.CONSOLE}))
+    return act(f"console: {name}", lasts_s, partial(of, begin), partial(of, end), Need.CONSOLE)
 
 
 def _alter(path: Path) -> None:
@@ -184,19 +188,9 @@ def _second_autopilot(rig: "Rig", _elapsed_s: float) -> None:
     rig.peer.inject(heartbeat(SECOND_SYSID))
 
 
-def _at_once(
-    name: str,
-    begin: Action,
-    *,
-    no_fix_in: frozenset[Phase] = frozenset({Phase.LANDING}),
-    needs: frozenset[Need] = frozenset(),
-) -> Fault:
-    return Fault(name, lasts_s=0.0, process=Process(begin), needs=needs, no_fix_in=no_fix_in)
-
-
 NAMES = (SUPERVISOR, *(process.name for process in PROCESSES))
 KILLED_AND_LIMITED = (
-    _at_once("all processes: kill -9", lambda rig: rig.kill_all()),
+    act("all processes: kill -9", 0.0, lambda rig: rig.kill_all()),
     *(killed(name) for name in NAMES),
     *(stopped(name, SHORT_S if name == SUPERVISOR else LONG_S) for name in NAMES),
     *(slow(name) for name in NAMES),
@@ -205,53 +199,35 @@ KILLED_AND_LIMITED = (
     *(limited(name, "no more files", resource.RLIMIT_NOFILE, _files) for name in NAMES),
 )
 AROUND_THEM = (
-    Fault(
-        "link: silent",
-        lasts_s=SHORT_S,
-        process=Process(lambda rig: _mute(rig, muted=True), lambda rig: _mute(rig, muted=False)),
-    ),
+    act("link: silent", SHORT_S, partial(_mute, muted=True), partial(_mute, muted=False)),
     Fault("link: garbage", lasts_s=SHORT_S, process=Process(during=_noise)),
-    _at_once("link: autopilot reboots", lambda rig: rig.peer.reboot()),
-    Fault(
+    act("link: autopilot reboots", 0.0, lambda rig: rig.peer.reboot()),
+    act(
         "link: other baud rate",
-        lasts_s=SHORT_S,
-        process=Process(lambda rig: _other_baud(rig, other=True), lambda rig: _other_baud(rig, other=False)),
-        needs=frozenset({Need.SERIAL}),
+        SHORT_S,
+        partial(_other_baud, other=True),
+        partial(_other_baud, other=False),
+        Need.SERIAL,
     ),
     Fault("link: second autopilot", lasts_s=SHORT_S, process=Process(during=_second_autopilot)),
-    Fault(
-        "disk: full",
-        lasts_s=SHORT_S,
-        process=Process(_fill, lambda rig: (rig.out / "filler").unlink(missing_ok=True)),
-        needs=DISK,
-    ),
-    Fault(
-        "disk: read-only",
-        lasts_s=SHORT_S,
-        process=Process(
-            lambda rig: _mount(rig.out, "-o", "remount,ro"), lambda rig: _mount(rig.out, "-o", "remount,rw")
-        ),
-        needs=DISK,
-    ),
+    act("disk: full", SHORT_S, _fill, lambda rig: (rig.out / "filler").unlink(missing_ok=True), Need.DISK),
+    act("disk: read-only", SHORT_S, partial(_remount, how="ro"), partial(_remount, how="rw"), Need.DISK),
     switched("disk: slow", Switch.FSYNC_S, SLOW_FSYNC_S),
-    Fault("disk: gone", lasts_s=SHORT_S, process=Process(lambda rig: _unmount(rig.out)), needs=DISK),
-    Fault(
-        "shared memory: full",
-        lasts_s=SHORT_S,
-        process=Process(_fill_shared, _free_shared),
-        needs=frozenset({Need.SHARED_MEMORY}),
-    ),
+    act("disk: gone", SHORT_S, lambda rig: _unmount(rig.out), nothing, Need.DISK),
+    act("shared memory: full", SHORT_S, _fill_shared, _free_shared, Need.SHARED_MEMORY),
     switched("wall clock: a year ahead", Switch.WALL_CLOCK_S, JUMP_S),
     switched("wall clock: a year back", Switch.WALL_CLOCK_S, -JUMP_S),
-    _at_once("model: file altered, anchor killed", _alter_model, needs=frozenset({Need.MODEL})),
+    act("model: file altered, anchor killed", 0.0, _alter_model, nothing, Need.MODEL),
     switched("model: provider lost", Switch.NO_PROVIDER, 1.0, Need.MODEL),
-    # before the first fix nothing has opened it yet
-    _at_once("map: file removed", lambda rig: rig.map_path.unlink(), no_fix_in=frozenset({Phase.LANDING, Phase.START})),
-    _at_once("map: file altered", lambda rig: _alter(rig.map_path)),
+    replace(  # before the first fix nothing has opened it yet
+        act("map: file removed", 0.0, lambda rig: rig.map_path.unlink()),
+        no_fix_in=frozenset({Phase.LANDING, Phase.START}),
+    ),
+    act("map: file altered", 0.0, lambda rig: _alter(rig.map_path)),
     console("kill -9", 0.0, lambda it: it.signal(signal.SIGKILL), lambda _: None),
     console("SIGSTOP", LONG_S, lambda it: it.signal(signal.SIGSTOP), lambda it: it.signal(signal.SIGCONT)),
     console(f"flooded by {EVENT_CLIENTS + ASKING_CLIENTS} clients", LONG_S, Console.flood, Console.end_flood),
-    Fault("processor: saturated", lasts_s=LONG_S, process=Process(_saturate, _rest)),
+    act("processor: saturated", LONG_S, _saturate, _rest),
     Fault(
         "heat: 40 to 97 to 40 C",
         lasts_s=LONG_S,

@@ -81,9 +81,9 @@ class EditedSensors:
         self._newest: VehicleState | None = None
         self._zero_s = 0.0
 
-    def alter(self, edit: Edit | None, zero_s: float = 0.0) -> None:
-        """From now on; None: true readings again. ``zero_s``: of the readings' time in the times of ``edit``."""
-        self._stepwise, self._zero_s = None if edit is None else Stepwise(edit), zero_s
+    def alter(self, edit: Edit, zero_s: float = 0.0) -> None:
+        """From now on, with one shot for each. ``zero_s``: of the readings' time in the times of ``edit``."""
+        self._stepwise, self._zero_s = None if edit is unchanged else Stepwise(edit), zero_s
         self._newest = None
 
     def read(self, state: State) -> Readings:

@@ -9,14 +9,14 @@ from terrafix.core.errors import UsageError
 from terrafix_lab.faults import edits, pictures
 from terrafix_lab.faults.edits import Edit, Span, StateEdit, during
 from terrafix_lab.faults.fault import Fault, Need
+from terrafix_lab.faults.messages import outliers
 from terrafix_lab.faults.processes import AROUND_THEM, KILLED_AND_LIMITED, SHORT_S
 
-FROZEN_S, FORGED_S, LATE_S, FALLING_BEHIND_S = 15.0, 10.0, 1.0, 40.0
+FROZEN_S, FORGED_S, LATE_S = 15.0, 10.0, 1.0
 BUFFERS = 4
 STILL_SHARE, LATE_TELEMETRY_S = 0.5, 2.0
 DROPPED, DOUBLED, SEED = 0.15, 0.15, 1
-PIXELS, LIVE = frozenset({Need.PIXELS}), frozenset({Need.LIVE})
-UNKNOWN = frozenset({Need.UNKNOWN})
+PIXELS, UNKNOWN = frozenset({Need.PIXELS}), frozenset({Need.UNKNOWN})
 
 
 def whole(edit: Edit) -> Callable[[Span], Edit]:
@@ -34,64 +34,36 @@ def shown(change: pictures.Change) -> Callable[[Span], Edit]:
 
 
 def in_turn(name: str, words: str, *faults: Fault) -> Fault:
-    """Faults of the source that follow each other, each as long as it lasts."""
+    """Faults of camera or telemetry that follow each other, each as long as it lasts."""
 
-    def source(span: Span) -> Edit:
-        spans = list(accumulate((f.lasts_s or 0.0 for f in faults), initial=span.from_s))
-        edited = [f.edit(Span(a, b, f.name)) for f, (a, b) in zip(faults, pairwise(spans), strict=True)]
+    def each(part: Callable[[Fault, Span], Edit], span: Span) -> Edit:
+        begins_s = accumulate((f.lasts_s or 0.0 for f in faults), initial=span.from_s)
+        edited = [part(f, Span(a, b, f.name)) for f, (a, b) in zip(faults, pairwise(begins_s), strict=True)]
         return lambda shots: reduce(lambda given, edit: edit(given), edited, shots)
 
+    camera, reports = partial(each, Fault.of_camera), partial(each, Fault.of_telemetry)
     needs, lasts_s = frozenset().union(*(f.needs for f in faults)), sum(f.lasts_s or 0.0 for f in faults)
-    return Fault(name, words, lasts_s, source, needs=needs, is_true=all(f.is_true for f in faults))
+    return Fault(name, words, lasts_s, camera, reports, needs=needs, is_true=all(f.is_true for f in faults))
 
 
 NONE = Fault("none", lasts_s=0.0, is_true=True)
+
+
+def camera(name: str, words: str, source: Callable[[Span], Edit], *needs: Need) -> Fault:
+    return Fault(f"camera: {name}", words, SHORT_S, source, needs=frozenset(needs), is_true=True)
+
+
 CAMERA = (
-    Fault("camera: unplugged", "No frame comes.", SHORT_S, edits.unplugged, is_true=True),
-    Fault("camera: frozen", "One picture again and again.", SHORT_S, pictures.frozen, is_true=True),
-    Fault("camera: black", "Black pictures.", SHORT_S, pictures.black, is_true=True),
-    Fault(
-        "camera: overexposed",
-        "All but the darkest ground is white.",
-        SHORT_S,
-        shown(pictures.overexposed),
-        needs=PIXELS,
-        is_true=True,
-    ),
-    Fault("camera: defocused", "Blurred pictures.", SHORT_S, shown(pictures.defocused), needs=PIXELS, is_true=True),
-    Fault(
-        "camera: wrong resolution",
-        "Half the width and height.",
-        SHORT_S,
-        shown(pictures.halved),
-        needs=PIXELS,
-        is_true=True,
-    ),
-    Fault("camera: no JPEG", "Bytes that are no image.", SHORT_S, pictures.torn, is_true=True),
-    Fault(
-        "camera: each image ten times",
-        "Ten times the frames.",
-        SHORT_S,
-        partial(edits.repeated, times=10),
-        needs=LIVE,
-        is_true=True,
-    ),
-    Fault(
-        "camera: stamps 5 s ahead",
-        "Time stamps in the future.",
-        SHORT_S,
-        partial(edits.stamped, by_s=5.0),
-        needs=LIVE,
-        is_true=True,
-    ),
-    Fault(
-        "camera: stamps 3 s late",
-        "Time stamps in the past.",
-        SHORT_S,
-        partial(edits.stamped, by_s=-3.0),
-        needs=LIVE,
-        is_true=True,
-    ),
+    camera("unplugged", "No frame comes.", edits.unplugged),
+    camera("frozen", "One picture again and again.", pictures.frozen),
+    camera("black", "Black pictures.", pictures.black),
+    camera("overexposed", "All but the darkest ground is white.", shown(pictures.overexposed), Need.PIXELS),
+    camera("defocused", "Blurred pictures.", shown(pictures.defocused), Need.PIXELS),
+    camera("wrong resolution", "Half the width and height.", shown(pictures.halved), Need.PIXELS),
+    camera("no JPEG", "Bytes that are no image.", pictures.torn),
+    camera("each image ten times", "Ten times the frames.", partial(edits.repeated, times=10), Need.LIVE),
+    camera("stamps 5 s ahead", "Time stamps in the future.", partial(edits.stamped, by_s=5.0), Need.LIVE),
+    camera("stamps 3 s late", "Time stamps in the past.", partial(edits.stamped, by_s=-3.0), Need.LIVE),
 )
 HEIGHTS = (
     ("height 30 % low", "The reported height is 30 % too small, and stated as good.", 0.7),
@@ -105,7 +77,7 @@ FALSE_INPUTS = (
         Fault(
             f"heading {off} degrees off",
             f"The reported heading is off by {off} degrees throughout.",
-            source=reported(edits.turned(off)),
+            telemetry=reported(edits.turned(off)),
         )
         for off in (90, 180)
     ),
@@ -121,14 +93,14 @@ FALSE_INPUTS = (
     Fault(
         "roll and pitch swapped",
         "Roll is reported as pitch, and pitch as roll.",
-        source=reported(edits.roll_pitch_swapped),
+        telemetry=reported(edits.roll_pitch_swapped),
     ),
     Fault(
         "roll and pitch negated",
         "Roll and pitch are reported with the wrong sign.",
-        source=reported(edits.roll_pitch_negated),
+        telemetry=reported(edits.roll_pitch_negated),
     ),
-    *(Fault(name, words, source=reported(edits.height_times(factor))) for name, words, factor in HEIGHTS),
+    *(Fault(name, words, telemetry=reported(edits.height_times(factor))) for name, words, factor in HEIGHTS),
     *(
         Fault(
             f"focal length {word}",
@@ -187,7 +159,7 @@ FALSE_INPUTS = (
     Fault(
         "telemetry 2 s late",
         "All that the autopilot reports is two seconds old when it gets its time.",
-        source=whole(edits.late_telemetry(LATE_TELEMETRY_S)),
+        telemetry=whole(edits.late_telemetry(LATE_TELEMETRY_S)),
     ),
     Fault(
         "pictures 1 s late",
@@ -198,10 +170,13 @@ FALSE_INPUTS = (
         "forged tilt",
         "For 10 s a roll is reported that is 15 degrees more than the true one.",
         FORGED_S,
-        reported(edits.rolled(15.0)),
+        telemetry=reported(edits.rolled(15.0)),
     ),
     Fault(
-        "forged heading", "For 10 s the reported heading jumps by 90 degrees.", FORGED_S, reported(edits.turned(90.0))
+        "forged heading",
+        "For 10 s the reported heading jumps by 90 degrees.",
+        FORGED_S,
+        telemetry=reported(edits.turned(90.0)),
     ),
 )
 # True inputs, of which some are missing or imprecise: the position must stay good.
@@ -213,7 +188,11 @@ SCARCE_INPUTS = (
         is_true=True,
     ),
     Fault(
-        "height unknown", "No height is reported.", source=reported(edits.height_unknown), needs=UNKNOWN, is_true=True
+        "height unknown",
+        "No height is reported.",
+        telemetry=reported(edits.height_unknown),
+        needs=UNKNOWN,
+        is_true=True,
     ),
     Fault(
         "start unknown", "No start is known.", origin=edits.start_unknown, needs=frozenset({Need.SEARCH}), is_true=True
@@ -224,17 +203,24 @@ IMPRECISE_INPUTS = (
     Fault(
         "height wrong by 10 %",
         "The reported height is 10 % too large.",
-        source=reported(edits.height_times(1.10)),
+        telemetry=reported(edits.height_times(1.10)),
         is_true=True,
     ),
     Fault(
         "compass wrong by 15 degrees",
         "The reported heading is off by 15 degrees.",
-        source=reported(edits.turned(15.0)),
+        telemetry=reported(edits.turned(15.0)),
         is_true=True,
     ),
     Fault(
-        "heading unknown", "No heading is reported.", source=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
+        "heading unknown", "No heading is reported.", telemetry=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
+    ),
+)
+MATCHES = (
+    Fault(
+        "350 m outlier fix",
+        "Every tenth map fix has an error of 350 m and a small covariance: it is rejected.",
+        matches=outliers,
     ),
 )
 INPUTS = {fault.name: fault for fault in (*CAMERA, *FALSE_INPUTS)}
@@ -247,7 +233,9 @@ SCENARIOS: tuple[Fault, ...] = (  # of several faults
     ),
 )
 MATRIX = (NONE, *KILLED_AND_LIMITED, *CAMERA, *AROUND_THEM)  # what `terrafix chaos` flies if no fault is named
-FAULTS = {fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *SCENARIOS)}
+FAULTS = {
+    fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *MATCHES, *SCENARIOS)
+}
 
 
 def fault_named(name: str) -> Fault:

@@ -2,8 +2,10 @@
 says so); any other exception is a bug."""
 
 import io
+import sqlite3
 import struct
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -38,10 +40,17 @@ from terrafix_lab.sim.autopilot.fuzz_wire import UNIX_NS, Autopilot
 from terrafix_lab.sim.autopilot.wire import heartbeat
 from terrafix_lab.sim.closed_loop.loopback import Loopback
 from terrafix_tools.autopilot_log.read import read_autopilot_log
+from terrafix_tools.mapping.area.files import read_area
+from terrafix_tools.mapping.datum import crs_of
+from terrafix_tools.mapping.package.height_values import height_statement, heights_of
+from terrafix_tools.mapping.source import open_raster
+from terrafix_tools.mapping.sources.tiles.files import MbtilesReader
+from terrafix_tools.mapping.sources.tiles.grid import Tile
 from terrafix_tools.mission.file import read_mission
 
 WIDTH, HEIGHT = 64, 48  # of the images
 SIDE_PX = 300  # of the map
+COMMANDS = (22, 16, 17, 31, 82, 84, 177, 179, 189, 195, 600, 601, 20, 85, 60_000)  # of a mission
 STEPS = 40  # of the telemetry, 0.02 s each
 
 
@@ -262,6 +271,85 @@ def _missions() -> list[bytes]:
     return ["\n".join(lines).encode(), plan.encode()]
 
 
+def _courses() -> list[bytes]:
+    """Waypoint files of both versions with commands of all kinds, and plans."""
+    rows = [f"{i}\t0\t3\t{command}\t1\t0\t0\t0\t48.01\t11.0\t60\t1" for i, command in enumerate(COMMANDS)]
+    text = "\n".join(["0\t1\t0\t16\t0\t0\t0\t0\t48.0\t11.0\t500\t1", "# a comment", *rows])
+    old = (
+        '{"type":"missionItem","command":16,"frame":3,"param1":0,"param2":0,"param3":0,"param4":0,"coordinate":[1,2,3]}'
+    )
+    mission = f'{{"plannedHomePosition":{{"coordinate":[48.0,11.0,500]}},"items":[{old}]}}'
+    return [*(f"QGC WPL {version}\n{text}".encode() for version in (110, 120)), mission.encode(), *_missions()]
+
+
+def _kml() -> list[bytes]:
+    """A KML in two encodings, and as an archive."""
+    ring = "<LinearRing><coordinates>14.3,48.1,0 14.4,48.1,0 14.4,48.2,0</coordinates></LinearRing>"
+    body = f"<Polygon><outerBoundaryIs>{ring}</outerBoundaryIs></Polygon><Point><coordinates>1,2</coordinates></Point>"
+    track = "<gx:Track><gx:coord>14.3 48.1 300</gx:coord><gx:coord>14.4 48.2 300</gx:coord></gx:Track>"
+    head = (
+        '<?xml version="1.0" encoding="{}"?><kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://g"><Document>'
+    )
+    documents = [
+        (head.format(name) + body + track + "</Document></kml>").encode(name)
+        for name in ("UTF-8", "UTF-16", "ISO-8859-1")
+    ]
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("doc.kml", documents[0])
+    return [*documents, archive.getvalue()]
+
+
+@cache
+def _tile_files() -> list[bytes]:
+    """A small MBTiles file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "t.mbtiles"
+        db = sqlite3.connect(path)
+        db.execute("PRAGMA page_size = 512")
+        db.execute("CREATE TABLE metadata (name TEXT, value TEXT)")
+        db.execute("CREATE TABLE tiles (zoom_level INT, tile_column INT, tile_row INT, tile_data BLOB)")
+        db.executemany("INSERT INTO metadata VALUES (?, ?)", [("bounds", "14.3,48.1,14.4,48.2"), ("scheme", "xyz")])
+        db.executemany("INSERT INTO tiles VALUES (10, 552, ?, ?)", [(355, b"one"), (356, b"two")])
+        db.commit()
+        db.close()
+        return [path.read_bytes()]
+
+
+def _read_tiles(path: Path) -> None:
+    reader = MbtilesReader(path)
+    try:
+        for row in (355, 356):
+            reader.get(Tile(10, 552, row))
+        reader.first(reader.zooms[-1])
+    finally:
+        reader.close()
+
+
+@cache
+def _elevations() -> list[bytes]:
+    """Small elevation models: feet by unit, by vertical system, with scale and offset."""
+    import rasterio
+    from rasterio.transform import Affine
+
+    profile = {"driver": "GTiff", "width": 8, "height": 8, "count": 1, "transform": Affine(10, 0, 3e5, 0, -10, 5e6)}
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "d.tif"
+        for crs, unit, scale in (("EPSG:32632", "US survey foot", 0.1), ("EPSG:32632+6360", "", 1.0)):
+            with rasterio.open(path, "w", crs=crs, dtype="int16", nodata=-99, **profile) as file:
+                file.write(np.full((1, 8, 8), 500, np.int16))
+                file.scales, file.offsets, file.units = (scale,), (10.0,), (unit,)
+            found.append(path.read_bytes())
+    return found
+
+
+def _read_elevation(path: Path) -> None:
+    with open_raster(path) as file:
+        heights = heights_of(file, str(path))
+        height_statement(file, path, heights, crs_of(file, path), (3e5, 5e6))
+
+
 def _start(data: bytes) -> None:
     parse_start(data.decode("utf-8", "replace"))
 
@@ -285,6 +373,10 @@ TARGETS: tuple[Target, ...] = (
     Target("map", _maps, _in_file(".gpkg", _read_map)),
     Target("mission", _missions, _in_file(".waypoints", read_mission)),
     Target("plan", _missions, _in_file(".plan", read_mission)),
+    Target("course", _courses, _in_file(".waypoints", lambda path: read_mission(path, course_only=True))),
+    Target("area", _kml, _in_file(".kml", lambda path: read_area(str(path), corridor_km=1.0))),
+    Target("tile file", _tile_files, _in_file(".mbtiles", _read_tiles)),
+    Target("elevation", _elevations, _in_file(".tif", _read_elevation)),
     Target("DataFlash log", _dataflash_logs, _in_file(".bin", read_autopilot_log)),
     Target("autopilot log", _logs, _in_file(".tlog", read_autopilot_log)),
     Target("start", lambda: [b"48.1,11.2"], _start),

@@ -27,6 +27,7 @@ from terrafix.messages import (
 )
 from terrafix.smoother.node import SmootherNode
 from terrafix_lab.faults.edits import Span
+from terrafix_lab.faults.messages import MatchEdit
 from terrafix_lab.faults.table import FAULTS
 from terrafix_lab.montecarlo.edited import edited
 from terrafix_lab.montecarlo.fault import DrawnFault
@@ -75,8 +76,10 @@ def run(plan: FlightPlan, *, refine: bool = True) -> Record:
 class Run:
     def __init__(self, plan: FlightPlan) -> None:
         flown = fly(plan, Terrain(plan.seed, plan.hills_m, plan.settled))
+        self._edit_match: MatchEdit = lambda match, _prediction: match
         if not isinstance(plan.fault, DrawnFault):
-            flown = edited(flown, FAULTS[plan.fault])
+            fault = FAULTS[plan.fault]
+            flown, self._edit_match = edited(flown, fault), fault.matches() if fault.matches else self._edit_match
         self._plan, self._flown = plan, flown
         self._node, self._smoother = EstimatorNode(), SmootherNode()
         self._frame = LocalFrame(flown.origin.lat_deg, flown.origin.lon_deg)
@@ -130,7 +133,10 @@ class Run:
                 published = self._send(odometry)
             find = find_match(matches, faults, shot.t_s, dark=picture.dark)
             late += [
-                (i + faults.late_frames(), faults.alter(lies.match(i, prediction, find), shot))
+                (
+                    i + faults.late_frames(),
+                    faults.alter(self._edit_match(lies.match(i, prediction, find), prediction), shot),
+                )
                 for prediction in published
                 if isinstance(prediction, Prediction)
             ]

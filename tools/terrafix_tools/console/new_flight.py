@@ -50,7 +50,7 @@ def _start(read: Description) -> dict[str, float | None] | None:
 
 
 def _waypoints(mission: Path) -> list[dict[str, float]]:
-    read = read_mission(mission)
+    read = read_mission(mission, course_only=True)
     placed = [(i.lat_deg, i.lon_deg) for i in read.items if i.lat_deg is not None and i.lon_deg is not None]
     home = (read.home_lat_deg, read.home_lon_deg)
     return [{"lat": lat, "lon": lon} for lat, lon in ([home] if home != (0.0, 0.0) else []) + placed]

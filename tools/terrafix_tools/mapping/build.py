@@ -21,8 +21,8 @@ from terrafix.map.format import (
     DRAWN_TABLE,
     FORMAT_VERSION,
     IMAGERY_TABLE,
-    Ce90Origin,
     DemGrid,
+    InputStatement,
     Layer,
     Manifest,
     VectorTable,
@@ -40,6 +40,8 @@ from terrafix_tools.mapping.package.gpkg import GpkgWriter, new_package
 from terrafix_tools.mapping.package.null_model import add_null_models
 from terrafix_tools.mapping.package.pyramid import BUILT_WITH, Pyramid, levels_of, open_renderer
 from terrafix_tools.mapping.source import ImagerySource
+from terrafix_tools.mapping.sources.collared import write_hidden
+from terrafix_tools.mapping.statements import accuracy_with_datum, merged
 from terrafix_tools.mapping.vectors.drawing import drawn_layer, spooled
 from terrafix_tools.mapping.vectors.tables import write_vectors
 from terrafix_tools.mapping.workers import GDAL_CACHE_BYTES, MAP_BUILD
@@ -162,11 +164,14 @@ def ensure_package(
     cached = cache_dir / f"{path.stem}-{key.hexdigest()[:16]}.gpkg"
     if cached.is_file():
         try:
-            MapPackage.open(cached).close()
+            opened = MapPackage.open(cached)
         except MapError:
             pass  # the cached file is damaged and is built again
         else:
-            return cached
+            says_what_was_read = bool(opened.manifest.inputs)  # else by a version that read units and datums otherwise
+            opened.close()
+            if says_what_was_read:
+                return cached
     return build(path, cached, dem=dem, date=date, licence=licence, progress=progress)
 
 
@@ -185,12 +190,14 @@ class _Build:
     ) -> None:
         self._writer, self._db, self._scratch, self._name = writer, db, scratch.absolute(), name
         self._descriptors, self._crew, self._bar = descriptors, crew, bar
+        self._inputs: list[InputStatement] = []
 
     def write(self, layers: list[LayerInput], elevation: ElevationInput | None, vectors: VectorInput | None) -> None:
         written: list[Layer] = []
         dem: DemGrid | None = None
-        for number, given in enumerate(layers, start=1):
+        for number, layer in enumerate(layers, start=1):
             table = IMAGERY_TABLE if number == 1 else f"{IMAGERY_TABLE}_{number}"
+            given = self._without_collar(layer, table)
             with given.open() as source:
                 written.append(self._layer(given, source, table))
                 if number == 1 and elevation:
@@ -211,8 +218,21 @@ class _Build:
             raise MapError("no road, water or building lies in this area; check --osm and --area")
         self._manifest(written, dem, tables)
 
+    def _without_collar(self, given: LayerInput, table: str) -> LayerInput:
+        """An image that is warped and has no mask, with the collar of its own pixels hidden; others unchanged."""
+        with given.open() as source:
+            if not isinstance(source, ImagerySource) or not source.warped or source.file_has_mask:
+                return given
+            hidden = self._scratch / f"{table}-hidden.tif"
+            if not write_hidden(source.path, hidden, self._bar):
+                return given
+            return dataclasses.replace(given, open=partial(ImagerySource, source.path, hidden=hidden))
+
     def _layer(self, given: LayerInput, source: Imagery, table: str) -> Layer:
         levels = levels_of(source)
+        statements = source.statements
+        ce90_m, origin, limited = accuracy_with_datum(given.ce90_m, statements)
+        self._inputs += merged(statements, limited)
         authority = source.crs.to_authority(min_confidence=100)
         layer = Layer(
             table=table,
@@ -220,8 +240,8 @@ class _Build:
             licence=given.licence,
             source=given.source,
             source_sha256=given.source_sha256,
-            ce90_m=given.ce90_m,
-            ce90_origin=Ce90Origin.DEFAULT if given.ce90_m is None else Ce90Origin.STATED,
+            ce90_m=ce90_m,
+            ce90_origin=origin,
             gsd_m=source.gsd_m,
             crs=":".join(authority) if authority else source.crs.to_wkt(),
             x_min=source.x_min,
@@ -253,6 +273,7 @@ class _Build:
     def _elevation(self, given: ElevationInput, source: Imagery) -> DemGrid:
         with given.open(source.crs, source.bounds) as elevation:  # validates it
             grid = elevation.grid
+            self._inputs.append(given.statement or elevation.statement)
         places = height_places(grid)
         opener = partial(open_heights, given.open, source.crs, source.bounds)
         tiles = render_pieces(opener, places, len(places), self._crew, per_worker=TILES_PER_WORKER)
@@ -282,6 +303,7 @@ class _Build:
                 ce90_m=newest.ce90_m,
                 layers=tuple(layers),
                 vectors=vectors,
+                inputs=tuple(self._inputs),
                 sealed=True,
             )
         )

@@ -16,3 +16,11 @@ class Datum(StrEnum):
     EGM96 = "egm96"  # mean sea level of receivers, autopilots and SRTM
     EGM2008 = "egm2008"  # Copernicus GLO-30
     ELLIPSOID = "ellipsoid"  # WGS84; often from photogrammetry with RTK
+
+
+class Unit(StrEnum):
+    """Unit of heights."""
+
+    METRE = "m"
+    FOOT = "ft"
+    US_FOOT = "us-ft"

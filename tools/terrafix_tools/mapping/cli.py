@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from terrafix_tools.mapping import cli_mosaic, cli_package
-from terrafix_tools.mapping.choices import Datum, Descriptors
+from terrafix_tools.mapping.choices import Datum, Descriptors, Unit
 
 app = typer.Typer(no_args_is_help=True, help="Make and inspect map packages.")
 
@@ -17,7 +17,8 @@ def map_build(
     *,
     out: Annotated[Path, typer.Option(help="Map package to write (.gpkg).")],
     area: Annotated[
-        str, typer.Option(help="W,S,E,N in degrees, .kml, .geojson, QGroundControl .plan or ArduPilot .waypoints.")
+        str,
+        typer.Option(help="W,S,E,N in degrees, .kml, .kmz, .geojson, QGroundControl .plan or ArduPilot .waypoints."),
     ] = "",
     buffer: Annotated[float | None, typer.Option(help="Kilometres around the area; default 20.")] = None,
     corridor: Annotated[
@@ -32,8 +33,13 @@ def map_build(
         float | None,
         typer.Option(help="Requested metres per pixel: selects the zoom of tiles, downsamples finer images."),
     ] = None,
-    dem: Annotated[str, typer.Option(help="Elevation raster, metres AMSL; or glo-30 (Copernicus).")] = "",
-    dem_datum: Annotated[Datum, typer.Option(help="Vertical datum of --dem.")] = Datum.EGM96,
+    dem: Annotated[str, typer.Option(help="Elevation raster, heights AMSL; or glo-30 (Copernicus).")] = "",
+    dem_datum: Annotated[
+        Datum | None, typer.Option(help="Vertical datum of --dem; default: as the file says, else egm96.")
+    ] = None,
+    dem_unit: Annotated[
+        Unit | None, typer.Option(help="Unit of the heights of --dem; default: as the file says.")
+    ] = None,
     geoid: Annotated[Path | None, typer.Option(help="Grid of the geoid EGM96, if PROJ has none.")] = None,
     osm: Annotated[str, typer.Option(help="Roads, water, buildings: an .osm.pbf, 'overpass' or its address.")] = "",
     osm_ce90: Annotated[
@@ -79,6 +85,7 @@ def map_build(
             gsd_m=gsd,
             dem=dem,
             dem_datum=dem_datum,
+            dem_unit=dem_unit,
             geoid=geoid,
             osm=osm,
             osm_ce90_m=osm_ce90,

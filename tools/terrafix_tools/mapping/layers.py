@@ -8,7 +8,7 @@ from typing import Protocol, Self
 import numpy as np
 from pyproj import CRS
 
-from terrafix.map.format import DemGrid
+from terrafix.map.format import DemGrid, InputStatement
 from terrafix_tools.mapping.area.polygons import Area
 
 Bounds = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max in the CRS
@@ -48,6 +48,11 @@ class Imagery(Protocol):
         """False: the source has no validity mask; it is searched for a black or white collar."""
         ...
 
+    @property
+    def statements(self) -> tuple[InputStatement, ...]:
+        """What the files of the source were taken for."""
+        ...
+
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
         """A window inside the image: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255."""
         ...
@@ -63,6 +68,10 @@ class Elevation(Protocol):
 
     @property
     def grid(self) -> DemGrid: ...
+    @property
+    def statement(self) -> InputStatement:
+        """What the file was taken for."""
+        ...
 
     def read_tile(self, column: int, row: int) -> np.ndarray:
         """(256, 256) float32, NaN = void. Tile indices start at the grid's corner; outside the grid is void."""
@@ -95,6 +104,7 @@ class ElevationInput:
     open: Callable[[CRS, Bounds], Elevation]
     source: str
     licence: str = ""
+    statement: InputStatement | None = None  # None: that of the opened elevation
 
 
 @dataclass(frozen=True)

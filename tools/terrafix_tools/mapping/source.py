@@ -1,6 +1,8 @@
 """Imagery for the map builder: any GDAL raster as north-up windows of 8-bit BGR with a mask."""
 
 import math
+import re
+import uuid
 import warnings
 from pathlib import Path
 from types import TracebackType
@@ -9,44 +11,62 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+import rasterio.shutil
 from pyproj import CRS, Geod, Transformer
 from pyproj.exceptions import ProjError
-from rasterio.enums import ColorInterp, Resampling
+from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from terrafix.core.errors import MapError
+from terrafix.map.format import InputStatement
+from terrafix_tools.mapping.datum import check_datum, crs_of
+from terrafix_tools.mapping.sources.utm import utm_epsg
+from terrafix_tools.mapping.ways import accuracy_to_wgs84
 
+NODATA = re.compile("<NoDataValue>([^<]*)</NoDataValue>")
 SAMPLE_PX = 1024  # side of the downsampled image that determines the value range of deep pixels
 STRETCH_PERCENT = (0.5, 99.5)  # percentiles of the sample; 16-bit and float pixels outside saturate
 
 
 class ImagerySource:
-    """North-up view of an image: pixel (r, c) covers [x_min + c px, y_max - r py) in `crs`. A context manager."""
+    """North-up view of an image: pixel (r, c) covers [x_min + c px, y_max - r py) in `crs`. A context manager.
 
-    def __init__(self, path: Path) -> None:
+    ``hidden``: a raster on the image's own pixels, not zero where they are a collar. ``raw``: the image's own pixels,
+    whatever their place on the ground."""
+
+    def __init__(self, path: Path, *, hidden: Path | None = None, raw: bool = False) -> None:
         self.path = path
         self._file = open_raster(path)
         self._data: Any = self._file
-        crs = crs_of(self._file, path)
+        self._hidden: Any = None
+        self._own_crs = crs = crs_of(self._file, path)
         transform: Affine = self._file.transform
-        self.warped = not (transform.b == 0 and transform.d == 0 and transform.a > 0 and transform.e < 0)
+        upright = transform.b == 0 and transform.d == 0 and transform.a > 0 and transform.e < 0
         _check_place(self._file, crs, path)
-        if crs.is_geographic:
-            crs, self.warped = _utm_of(self._file, crs), True
+        self.warped = not raw and (not upright or crs.is_geographic)
+        if crs.is_geographic and not raw:
+            crs = _utm_of(self._file, crs)
         self.crs = crs
         self._colours = self._colour_table()
+        self._nodata_is_held = self._file.nodata is None or holds(self._file.dtypes[0], self._file.nodata)
         if self.warped:
-            self._data = self._north_up(crs)
+            self._data, self._hidden = self._north_up(crs, hidden)
         self.width_px, self.height_px = int(self._data.width), int(self._data.height)
-        self.pixel_x, self.pixel_y = float(self._data.transform.a), -float(self._data.transform.e)
-        self.x_min, self.y_max = float(self._data.transform.c), float(self._data.transform.f)
+        grid = Affine(1, 0, 0, 0, -1, self.height_px) if raw else self._data.transform
+        self.pixel_x, self.pixel_y = float(grid.a), -float(grid.e)
+        self.x_min, self.y_max = float(grid.c), float(grid.f)
         self.bands = self._choose_bands()
-        # A mask in the file (alpha, nodata, mask band) is used; without one a black collar is searched.
+        # A mask in the file (alpha, mask band, nodata, in this order) is used; without one a collar is searched, of a
+        # warped image on its own pixels.
+        alpha = [i for i, colour in enumerate(self._file.colorinterp, start=1) if colour == ColorInterp.alpha]
         flags = [f for band in self._file.mask_flag_enums for f in band]
-        self.has_mask = self.warped or any(f.name != "all_valid" for f in flags)
+        by_value = self._nodata_is_held and self._file.nodata is not None
+        self.file_has_mask = by_value or bool(alpha) or MaskFlags.per_dataset in flags
+        self.has_mask = self.warped or self.file_has_mask
+        self._alpha = alpha[0] if alpha and self._file.nodata is not None and not self.warped else None
         self._stretch = self._find_stretch()
 
     def __enter__(self) -> "ImagerySource":
@@ -55,6 +75,8 @@ class ImagerySource:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._hidden is not None:
+            self._hidden.close()
         if self._data is not self._file:
             self._data.close()
         self._file.close()
@@ -80,6 +102,29 @@ class ImagerySource:
         y = self.y_max - 0.5 * self.height_px * self.pixel_y
         return ground_pixel_m(self.crs, x, y, self.pixel_x, self.pixel_y)
 
+    @property
+    def statements(self) -> tuple[InputStatement, ...]:
+        """What the file was taken for."""
+        crs, file = self._own_crs, self._file
+        assumed = check_datum(file, self.path)
+        x, y = file.transform @ (file.width / 2, file.height / 2)
+        accuracy_m, missing = accuracy_to_wgs84(crs, x, y, assumed)
+        nodata = stated_nodata(file)
+        if nodata and (file.nodata is None or not self._nodata_is_held):
+            assumed += (f"nodata value {nodata} ignored, {file.dtypes[0]} cannot hold it",)
+        elif nodata and ColorInterp.alpha in file.colorinterp:
+            assumed += (f"the alpha band is the mask, and not nodata {nodata}",)
+        return (
+            InputStatement(
+                name=self.path.name,
+                kind="imagery",
+                unit=crs.axis_info[0].unit_name if crs.axis_info else "metre",
+                datum=crs.name,
+                accuracy_m=accuracy_m,
+                assumed=assumed + missing,
+            ),
+        )
+
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
         """A window inside the image: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255."""
         window = Window(column, row, width, height)
@@ -103,9 +148,17 @@ class ImagerySource:
             bands = np.stack([self._data.read(band, window=window) for band in self.bands])
         else:
             bands = self._data.read(self.bands, window=window)
-        if self.has_mask:
-            return bands, self._data.dataset_mask(window=window)
-        return bands, np.full(bands.shape[1:], 255, np.uint8)
+        return bands, self._read_mask(window)
+
+    def _read_mask(self, window: Window) -> np.ndarray:
+        if self._alpha is not None:  # GDAL would take the nodata value of its bands
+            return (self._file.read(self._alpha, window=window) > 0).astype(np.uint8)
+        if not self.has_mask:
+            return np.full((int(window.height), int(window.width)), 255, np.uint8)
+        mask: np.ndarray = self._data.dataset_mask(window=window)
+        if self._hidden is not None:
+            mask = np.where(self._hidden.read(1, window=window) == 0, mask, 0).astype(np.uint8)
+        return mask
 
     def _to_bytes(self, bands: np.ndarray) -> np.ndarray:
         if self._colours is not None:
@@ -116,8 +169,8 @@ class ImagerySource:
         scaled = (np.nan_to_num(bands.astype(np.float32), nan=low) - low) * (255.0 / (high - low))
         return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
-    def _north_up(self, crs: CRS) -> Any:
-        """The image resampled to a north-up grid of equal ground sampling."""
+    def _north_up(self, crs: CRS, hidden: Path | None) -> tuple[Any, Any]:
+        """The image resampled to a north-up grid of equal ground sampling, and the raster ``hidden`` likewise."""
         source = self._file
         geo_crs = CRS.from_user_input(source.crs.to_wkt())
         a = source.transform
@@ -137,15 +190,25 @@ class ImagerySource:
         pixel = step_m / ground_pixel_m(crs, middle_x, middle_y, 1.0, 1.0)
         x_min = math.floor(float(x.min()) / pixel) * pixel
         y_max = math.ceil(float(y.max()) / pixel) * pixel
-        return WarpedVRT(
+        grid = {
+            "crs": crs.to_wkt(),
+            "transform": Affine(pixel, 0, x_min, 0, -pixel, y_max),
+            "width": math.ceil((float(x.max()) - x_min) / pixel),
+            "height": math.ceil((y_max - float(y.min())) / pixel),
+        }
+        has_alpha = ColorInterp.alpha in source.colorinterp
+        nodata = source.nodata if self._nodata_is_held and not has_alpha else None
+        view = WarpedVRT(
             source,
-            crs=crs.to_wkt(),
-            transform=Affine(pixel, 0, x_min, 0, -pixel, y_max),
-            width=math.ceil((float(x.max()) - x_min) / pixel),
-            height=math.ceil((y_max - float(y.min())) / pixel),
+            **grid,
             resampling=Resampling.nearest if self._colours is not None else Resampling.bilinear,
-            add_alpha=ColorInterp.alpha not in source.colorinterp and source.nodata is None,
+            add_alpha=not has_alpha and nodata is None,
+            src_nodata=nodata,
+            nodata=nodata,
         )
+        if hidden is None:
+            return view, None
+        return view, WarpedVRT(rasterio.open(hidden), **grid, resampling=Resampling.nearest)
 
     def _colour_table(self) -> np.ndarray | None:
         """(256, 3) RGB of a palette image."""
@@ -182,7 +245,7 @@ class ImagerySource:
         shape = (max(1, int(self.height_px / shrink)), max(1, int(self.width_px / shrink)))
         try:
             sample = self._data.read(self.bands, out_shape=(len(self.bands), *shape)).astype(np.float64)
-            mask = self._data.dataset_mask(out_shape=shape) > 0
+            mask = self._data.dataset_mask(out_shape=shape) > 0 if self.has_mask else np.ones(shape, bool)
         except RasterioError as error:
             raise MapError(f"{self.path}: cannot be read ({error}); check or download the file again") from None
         values = sample[:, mask]
@@ -193,6 +256,27 @@ class ImagerySource:
         return (low, high) if high > low else (low, low + 1.0)
 
 
+def stated_nodata(file: Any) -> str:
+    """The nodata value as the file states it, which rasterio leaves out where pixels cannot hold it; empty: none."""
+    name = f"/vsimem/{uuid.uuid4().hex}.vrt"
+    rasterio.shutil.copy(file, name, driver="VRT")
+    try:
+        with rasterio.open(name) as view:
+            found = NODATA.search(" ".join(view.tags(ns="xml:VRT").values()))
+    finally:
+        rasterio.shutil.delete(name)
+    return found[1] if found else ""
+
+
+def holds(dtype: str, nodata: float) -> bool:
+    """Whether a pixel of this type can have the value."""
+    kind = np.dtype(dtype)
+    if kind.kind not in "iu":
+        return True
+    limits = np.iinfo(kind)
+    return math.isfinite(nodata) and nodata == int(nodata) and limits.min <= nodata <= limits.max
+
+
 def open_raster(path: Path) -> Any:
     """Opens a raster. Raises MapError."""
     if not path.is_file():
@@ -201,7 +285,7 @@ def open_raster(path: Path) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)  # reported below as an error
             return rasterio.open(path)
-    except RasterioError:
+    except (RasterioError, UnicodeDecodeError):  # GDAL's message may quote the bytes of a damaged file
         raise MapError(f"{path}: not an image that GDAL can read; give a GeoTIFF") from None
 
 
@@ -215,21 +299,6 @@ def ground_pixel_m(crs: CRS, x: float, y: float, pixel_x: float, pixel_y: float)
 def ground_distance_m(crs: CRS, a: tuple[float, float], b: tuple[float, float]) -> float:
     lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform([a[0], b[0]], [a[1], b[1]])
     return float(Geod(ellps="WGS84").inv(lon_deg[0], lat_deg[0], lon_deg[1], lat_deg[1])[2])
-
-
-def crs_of(dataset: Any, path: Path) -> CRS:
-    """Horizontal CRS of a raster. Raises MapError when it is not georeferenced."""
-    if dataset.transform == Affine.identity():
-        raise MapError(f"{path}: has no georeference; give a GeoTIFF, or add one with gdal_translate -a_ullr -a_srs")
-    if dataset.crs is None:
-        raise MapError(f"{path}: has no coordinate system; add it with gdal_translate -a_srs EPSG:nnnnn IN OUT")
-    authority = dataset.crs.to_authority()
-    crs = CRS.from_authority(*authority) if authority else CRS.from_wkt(dataset.crs.to_wkt())
-    if crs.is_compound:
-        crs = crs.sub_crs_list[0]
-    if not (crs.is_projected or crs.is_geographic):
-        raise MapError(f"{path}: coordinate system '{crs.name}' is not on the earth; reproject with gdalwarp -t_srs")
-    return crs
 
 
 def _check_place(dataset: Any, crs: CRS, path: Path) -> None:
@@ -251,7 +320,6 @@ def _check_place(dataset: Any, crs: CRS, path: Path) -> None:
 
 def _utm_of(dataset: Any, crs: CRS) -> CRS:
     """UTM zone of the centre: EPSG 326zz north, 327zz south."""
-    west, south, east, north = dataset.bounds
-    lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform((west + east) / 2, (south + north) / 2)
-    zone = int((lon_deg + 180.0) // 6.0) % 60 + 1
-    return CRS.from_epsg((32600 if lat_deg >= 0 else 32700) + zone)
+    x, y = dataset.transform @ (dataset.width / 2, dataset.height / 2)
+    lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform(x, y)
+    return CRS.from_epsg(utm_epsg(lon_deg, lat_deg))

@@ -52,12 +52,14 @@ class Item:
 
 @dataclass(frozen=True)
 class Mission:
-    """``name``: the file, or a description of a generated mission. Home is the position of the vehicle at the start."""
+    """``name``: the file, or a description of a generated mission. Home is the position of the vehicle at the start.
+    ``notes``: what of the file was assumed or left out, a line each."""
 
     name: str
     home_lat_deg: float
     home_lon_deg: float
     items: tuple[Item, ...]
+    notes: tuple[str, ...] = ()
 
     def starts_on_ground(self) -> bool:
         """True when the mission begins with a take-off from home; otherwise it begins in the air at the first

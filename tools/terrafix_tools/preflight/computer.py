@@ -26,6 +26,7 @@ from terrafix_engines.runtime import ModelFileError
 from terrafix_tools.live import swapped_hint
 from terrafix_tools.mapping.check.mission import mission_route, uncovered
 from terrafix_tools.mapping.check.text import where
+from terrafix_tools.mapping.statements import way_here
 from terrafix_tools.mission.file import read_mission
 from terrafix_tools.preflight.lines import Line, fail, ok, warn
 
@@ -81,6 +82,9 @@ def _integrity(package: MapPackage) -> Iterator[Line]:
     signed = f"signed by {', '.join(package.signed_by)}" if package.signed_by else "not signed"
     shows = "roads, water and buildings, no imagery" if newest.is_drawn else "imagery"
     yield ok("map", f"{package.path.name}: all tiles valid; {signed}; {shows} of {newest.date or 'unknown date'}")
+    here = way_here(package)
+    if here is not None:
+        yield fail("map", here, "install the grid on this computer, too: pyproj sync --file GRID")
 
 
 def _start(package: MapPackage, config: Config) -> Iterator[Line]:
@@ -111,6 +115,8 @@ def _cover(package: MapPackage, mission: Path) -> Iterator[Line]:
         yield fail("mission", f"leaves the map for {where(outside[0])}", "move the mission, or build a larger map")
     else:
         yield ok("mission", f"its {course.along_m[-1] / 1000:.1f} km lie on the map")
+    for note in plan.notes:
+        yield warn("mission", note, "if the vehicle flies to it, put a waypoint there")
 
 
 def _camera(config: Config) -> Iterator[Line]:

@@ -55,9 +55,12 @@ class Fragment:
         """A measurement has tied the fragment to the flight."""
         self.confirmed = self.joined = True
 
-    def add_frame(self, t_s: float, evidence: "MotionEvidence") -> None:
-        """``evidence``: of the motion of the frame at ``t_s``."""
+    def add_frame(self, t_s: float, evidence: "MotionEvidence", *, only_by_place: bool = False) -> None:
+        """``evidence``: of the motion of the frame at ``t_s``. ``only_by_place``: neither motion nor duration confirms
+        the fragment, because images have contradicted inertial readings."""
         self.frames += 1
+        if only_by_place:
+            return
         self.consistent_frames = self.consistent_frames + 1 if evidence.supports_same_flight(self.map_llr) else 0
         moves_as_predicted = self.consistent_frames >= CONFIRM_FRAMES
         timed_out = t_s - self.start_s >= CONFIRM_AFTER_S and self.frames >= CONFIRM_AFTER_FRAMES

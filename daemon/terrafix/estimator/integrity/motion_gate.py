@@ -29,8 +29,17 @@ class MotionInnovation:
     @cached_property
     def gated(self) -> Innovation:
         """The part of the residual that no manoeuvre explains."""
-        manoeuvre_mps2 = MAX_MANOEUVRE_WITH_IMU_MPS2 if self.inertial else MAX_MANOEUVRE_MPS2
-        return Innovation(self._unexplained_m(manoeuvre_mps2), self.cov_m2, GATE_D2)
+        return Innovation(self._unexplained_m(self._manoeuvre_m), self.cov_m2, GATE_D2)
+
+    @property
+    def with_manoeuvre(self) -> Innovation:
+        """The whole residual, whose covariance has the hardest manoeuvre in it: for comparing hypotheses."""
+        return Innovation(self.residual_m, self.cov_m2 + self._manoeuvre_m**2 * np.eye(3), GATE_D2)
+
+    @property
+    def _manoeuvre_m(self) -> float:
+        """Displacement by the hardest manoeuvre."""
+        return 0.5 * (MAX_MANOEUVRE_WITH_IMU_MPS2 if self.inertial else MAX_MANOEUVRE_MPS2) * self.dt_s**2
 
     @property
     def allows_standstill(self) -> bool:
@@ -38,8 +47,7 @@ class MotionInnovation:
         frame to the next."""
         return Innovation(self._unexplained_m(0.0), self.cov_m2, GATE[3]).is_accepted
 
-    def _unexplained_m(self, manoeuvre_mps2: float) -> np.ndarray:
-        """(3,): the part of the residual that an acceleration of ``manoeuvre_mps2`` over ``dt_s`` does not explain."""
-        manoeuvre_m = 0.5 * manoeuvre_mps2 * self.dt_s**2
+    def _unexplained_m(self, manoeuvre_m: float) -> np.ndarray:
+        """(3,): the part of the residual beyond ``manoeuvre_m``."""
         scale = max(0.0, 1.0 - manoeuvre_m / max(float(np.linalg.norm(self.residual_m)), 1e-9))
         return self.residual_m * scale

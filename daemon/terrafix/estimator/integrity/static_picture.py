@@ -2,12 +2,46 @@
 
 import math
 
+import numpy as np
+
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.messages import Odometry, Verdict
 
 # Change of roll or pitch under a static image. An attitude filter of a vehicle at rest drifts less in a minute.
 MIN_TILT_CHANGE_RAD = math.radians(1.0)  # [tuned]
 # Longest static image in the air [s]. "Static" means below 0.006 degrees; no multirotor holds its attitude that well.
 MAX_STATIC_S = 3.0  # [tuned]
+
+MIN_MATCHES = 8  # for an affine map between two images [spec: of plane_motion.MIN_PAIRS]
+# 1-sigma of a matched coordinate: images whose matches moved by less on average show the same view to the tracker,
+# as those of a frozen picture do that an encoder or a stabiliser shifts from frame to frame.
+UNCHANGED_SIGMAS = 3.0  # [spec: three sigmas]
+
+
+class ViewChange:
+    """Whether the view of a frame is that of the frame before, as far as the tracker can tell."""
+
+    def __init__(self) -> None:
+        self._before: Odometry | None = None
+        self._image: np.ndarray | None = None  # (3, 2): of the frame before, from its keyframe
+
+    def is_unchanged(self, odometry: Odometry) -> bool:
+        """``odometry``: of each frame in turn. False also where the two have no keyframe in common."""
+        before, image, self._before, self._image = self._before, self._image, odometry, None
+        if odometry.verdict is not Verdict.ACCEPTED or len(odometry.two_view) < MIN_MATCHES:
+            return False
+        pairs = np.array(odometry.two_view)
+        keyframe = np.column_stack([pairs[:, :2], np.ones(len(pairs))])
+        self._image = np.linalg.lstsq(keyframe, pairs[:, 2:], rcond=None)[0]
+        if before is None:
+            return False
+        if odometry.keyframe_id == before.frame_id:
+            moved = pairs[:, 2:] - pairs[:, :2]
+        elif odometry.keyframe_id == before.keyframe_id and image is not None:
+            moved = keyframe @ (self._image - image)
+        else:
+            return False
+        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))) <= UNCHANGED_SIGMAS * odometry.sigma_norm
 
 
 class StaticPicture:
@@ -17,6 +51,11 @@ class StaticPicture:
         self._since_s: float | None = None
         self._attitude: Attitude | None = None  # at the first static image
         self._frozen = False
+
+    @property
+    def is_repeating(self) -> bool:
+        """The newest image was one of a frozen camera."""
+        return self._frozen
 
     def is_frozen(self, t_s: float, attitude: Attitude, *, static: bool, is_moving: bool) -> bool:
         """Whether the camera is frozen at the frame of ``t_s``; if so, until the view changes.

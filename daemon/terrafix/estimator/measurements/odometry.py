@@ -3,7 +3,7 @@ model, and what three keyframes saw together."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -14,7 +14,7 @@ from terrafix.estimator.filter_state import FilterState, FrameInput
 from terrafix.estimator.integrity.fragments import Fragment, MotionEvidence
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
-from terrafix.estimator.integrity.static_picture import StaticPicture
+from terrafix.estimator.integrity.static_picture import StaticPicture, ViewChange
 from terrafix.estimator.integrity.time_offset import Turn
 from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
@@ -23,6 +23,7 @@ from terrafix.estimator.measurements.heading import heading_innovation
 from terrafix.estimator.measurements.keyframe_link import LinkMeasurement, by_link, refused
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
+from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
 from terrafix.estimator.state import HEADING, HEIGHT, HORIZONTAL, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import CovarianceMode, Odometry, Verdict
 
@@ -66,7 +67,7 @@ class OdometryMeasurement:
 
     def __init__(self, state: FilterState) -> None:
         self._state = state
-        self._static_picture = StaticPicture()
+        self._static_picture, self._view_change = StaticPicture(), ViewChange()
         # Of the newest frame: time, keyframe, heading since that.
         self._heading_seen: tuple[int, int, float] | None = None
 
@@ -74,11 +75,14 @@ class OdometryMeasurement:
         """``before``: the newest node; ``increment()``: of the motion model, from there to the frame."""
         odometry, attitude, t_s = frame.odometry, frame.attitude, frame.t_s
         alone = Fragment(t_s, odometry.fragment_id)  # of a frame without odometry that is fused
+        self._state.orientation.refuses = False
         if odometry.verdict in NO_NEW_VIEW:
             return GatedOdometry(odometry.verdict, None, alone)
+        unchanged = self._view_change.is_unchanged(odometry)
+        repeats = odometry.static or (unchanged and self._static_picture.is_repeating)
         answer = self._first_motion(odometry, frame)
         if isinstance(answer, Verdict):
-            frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False)
+            frozen = self._static_picture.is_frozen(t_s, attitude, static=repeats, is_moving=False)
             return GatedOdometry(Verdict.STALLED if frozen else answer, None, alone)
         state, parent = self._state, answer.parent
         fragment, keyframe = state.fragments.of(parent), state.graph.state(parent).pose
@@ -88,24 +92,67 @@ class OdometryMeasurement:
         local_step_m = None if fragment.confirmed else in_fragment_m - fragment.displacement_m
         motion, innovation, was_confirmed = None, None, fragment.confirmed
         if attitude.stands or state.yaw_gauge is not None:  # nothing predicts the motion
-            if self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=False):
+            if self._static_picture.is_frozen(t_s, attitude, static=repeats, is_moving=False):
                 return GatedOdometry(Verdict.STALLED, None, alone)
             fragment.confirmed = True
             fragment.joined = fragment.joined or attitude.stands
         else:
             motion = self._innovation(t_s, keyframe.translation() + moved_m, answer, before, increment())
             innovation, moves = motion.gated, not motion.allows_standstill
-            frozen = self._static_picture.is_frozen(t_s, attitude, static=odometry.static, is_moving=moves)
-            if frozen or not innovation.is_accepted:
+            repeats = repeats or (unchanged and not innovation.is_accepted)
+            frozen = self._static_picture.is_frozen(t_s, attitude, static=repeats, is_moving=moves)
+            if not frozen:
+                self._weigh_orientation(answer, frame, before, motion)
+            wrong = not innovation.is_accepted or state.orientation.fault is not None
+            if frozen or wrong or self._is_flipped(answer, frame, before, motion):
                 verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
                 state.image_jump = None if frozen else (t_s, motion.residual_m[HORIZONTAL])
-                return GatedOdometry(verdict, None, alone, innovation=innovation)
+                return GatedOdometry(verdict, None, alone, innovation=innovation, motion_innovation=motion)
             if not fragment.confirmed:
                 self._weigh_fragment(fragment, frame, answer, before, motion)
         verdict = Verdict.ACCEPTED if fragment.confirmed else Verdict.UNCONFIRMED
         fragment.displacement_m = in_fragment_m
         disconnected = fragment.confirmed and not was_confirmed and not fragment.joined
         return GatedOdometry(verdict, answer, fragment, local_step_m, innovation, disconnected, motion)
+
+    def _weigh_orientation(
+        self, seen: KeyframeMotion, frame: FrameInput, before: NodeState, innovation: MotionInnovation
+    ) -> None:
+        """Whether turned or mirrored images explain a motion that upright ones do not."""
+        monitor, state = self._state.orientation, self._state
+        if innovation.gated.is_accepted and not monitor.suspects:
+            return
+
+        def likelihood(motion: KeyframeMotion) -> float:
+            keyframe = state.graph.state(seen.parent).pose
+            shown_m = keyframe.rotation().matrix() @ (motion.motion.p_m - seen.motion.p_m)
+            other = replace(innovation, residual_m=innovation.residual_m + shown_m)
+            heading = heading_innovation(state, frame.attitude, seen.parent, motion.motion.r, before)
+            return -0.5 * (other.with_manoeuvre.mahalanobis2 + heading.mahalanobis2)
+
+        others: dict[Orientation, float | None] = {}
+        for orientation in ORIENTATIONS:
+            motion = self._relative_motion(orientation.righted(seen.odometry), frame)
+            others[orientation] = likelihood(motion) if isinstance(motion, KeyframeMotion) else None
+        monitor.add(likelihood(seen), others)
+
+    def _is_flipped(
+        self, seen: KeyframeMotion, frame: FrameInput, before: NodeState, innovation: MotionInnovation
+    ) -> bool:
+        """Whether the image has turned by a quarter or a half since its keyframe, and the vehicle has not: its reported
+        heading goes on from the estimate."""
+        state, attitude = self._state, frame.attitude
+        if not innovation.inertial or attitude.yaw_rad is None:
+            return False
+        heading = heading_innovation(state, attitude, seen.parent, seen.motion.r, before)
+        if heading.is_accepted:
+            return False
+        turned_rad, sigma_rad = float(heading.residual[0]), math.sqrt(float(heading.covariance[0, 0]))
+        beyond_rad = math.remainder(turned_rad, 0.5 * math.pi)
+        was_rad = state.camera.yaw_rad(before.pose.rotation().matrix())
+        is_rad = state.camera.yaw_rad(state.camera.expected(attitude, before.calibration))
+        goes_on = abs(math.remainder(is_rad - was_rad, math.tau)) < 0.25 * math.pi
+        return goes_on and abs(turned_rad) > 0.25 * math.pi and abs(beyond_rad) <= HEADING_GATE * sigma_rad
 
     def _weigh_fragment(
         self,
@@ -121,7 +168,7 @@ class OdometryMeasurement:
         turns_agree = heading.mahalanobis2 <= HEADING_GATE**2
         inertial = innovation.inertial and self._state.continuity.inertial_since_fused
         evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree, inertial)
-        fragment.add_frame(frame.t_s, evidence)
+        fragment.add_frame(frame.t_s, evidence, only_by_place=self._state.images_contradicted)
 
     def turn(self, gated: GatedOdometry) -> Turn | None:
         """Change of heading since the frame before, when both were seen from one keyframe, or that frame is the

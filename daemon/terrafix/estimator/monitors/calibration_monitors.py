@@ -9,6 +9,8 @@ from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_from_quat, yaw_of
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
+from terrafix.estimator.monitors.image_shape import ShapeMonitor
 from terrafix.estimator.monitors.inertial import MOUNT_YAWS_DEG, InertialMonitor
 from terrafix.estimator.monitors.levelling import LevellingMonitor
 from terrafix.estimator.monitors.map_offsets import HEIGHT_NOISE, OffsetMonitor, log_height_ratio
@@ -24,6 +26,8 @@ MIN_TURN_SPACING_S = 1.0  # s between turns that count: images of one keyframe s
 HEADING_SIGMA_RAD, HEIGHT_SIGMA_SHARE = math.radians(10.0), 0.05
 YAW_NOISE_RAD = math.radians(3.0)  # 1-sigma of the heading of one pose against the reported one [tuned]
 REPORT_CHANGE = 0.2  # relative change of a factor or an angle after which a fault is reported again [tuned]
+# Faults whose images are refused from the frame on that shows them: the rest of the estimate is right.
+REFUSED_PICTURES = frozenset(orientation.quantity for orientation in ORIENTATIONS)
 # Verdicts on frames that were not correlated with the map.
 NOT_CORRELATED = (
     Verdict.BAD_IMAGE,
@@ -54,6 +58,7 @@ class Monitors:
         self._inertial = InertialMonitor()
         self._turns = TurnMonitor(math.radians(origin.yaw_sigma_deg))
         self._levelling = LevellingMonitor()
+        self._shape = ShapeMonitor()
         self._registration = Registration()
         heading = math.hypot(HEADING_SIGMA_RAD, math.radians(origin.yaw_sigma_deg))
         self._heading = OffsetMonitor(heading, YAW_NOISE_RAD)
@@ -61,22 +66,34 @@ class Monitors:
         self._times_ns: dict[int, int] = {}  # frame -> time, of frames that may be the keyframe of a later one
         self._turned_s = -math.inf  # time of the last turn that counted
         self._textured: int | None = None  # the newest frame with accepted odometry
+        self._orientation: Orientation | None = None
         self._reported: dict[str, Finding] = {}
 
     @property
     def sigma_m(self) -> float:
         """1-sigma per horizontal axis, to be added to the published covariance."""
-        if self._reported:
+        if any(quantity not in REFUSED_PICTURES for quantity in self._reported):
             return max(FAULT_SIGMA_M, self._registration.path_error_m)
         return self._registration.sigma_m
 
-    def on_odometry(self, odometry: Odometry, telemetry: Telemetry, path_m: float, agl_m: float) -> None:
-        """A frame. ``path_m`` since the frame before and ``agl_m``: by the graph's estimate."""
+    def on_odometry(
+        self,
+        odometry: Odometry,
+        telemetry: Telemetry,
+        path_m: float,
+        agl_m: float,
+        orientation: Orientation | None = None,
+    ) -> None:
+        """A frame. ``path_m`` since the frame before and ``agl_m``: by the graph's estimate. ``orientation``: of its
+        image, where that is not the described one."""
+        self._orientation = orientation
         self._times_ns[odometry.frame_id] = odometry.t_ns
         self._registration.add_path(path_m, agl_m)
         keyframe_ns = self._times_ns.get(odometry.keyframe_id)
         self._times_ns = {f: t for f, t in self._times_ns.items() if f >= odometry.keyframe_id}
         if odometry.verdict is not Verdict.ACCEPTED or keyframe_ns is None or keyframe_ns >= odometry.t_ns:
+            return
+        if orientation is not None:  # the fault is known: the others would explain it, too
             return
         self._textured = odometry.frame_id
         before, now = telemetry.at(keyframe_ns), telemetry.at(odometry.t_ns)
@@ -89,6 +106,7 @@ class Monitors:
             self._turns.add(motion.reported_rad, motion.turned_rad)
             span_s = keyframe_ns * 1e-9, odometry.t_ns * 1e-9
             self._levelling.add(pairs, before, now, self._r_b_c, span_s)
+            self._shape.add(pairs, before, now, self._r_b_c)
         if now.agl_m is None:
             return
         mounted = (motion, *(visual_motion(pairs, before, now, r_b_c) for r_b_c in self._other_mounts))
@@ -160,6 +178,12 @@ class Monitors:
             )
         if self._turns.mirrored:
             found["mirrored picture"] = Finding(None, "the images rotate opposite to the reported attitude")
+        if (orientation := self._orientation) is not None:
+            factor = float(orientation.turned_deg) if orientation.quantity == "picture turned" else None
+            found[orientation.quantity] = Finding(factor, orientation.detail)
+        if (ratio := self._shape.ratio) is not None:
+            detail = "the ground changes its shape in turns as if the two axes of the image had different scales"
+            found["aspect ratio"] = Finding(ratio, f"{detail}: crop the images instead of scaling them, or set fx")
         if self._levelling.fault:
             found["attitude"] = Finding(None, f"{self._levelling.fault}: images that are levelled by it do not agree")
         if self._height is not None and self._height.active:

@@ -48,11 +48,34 @@ def image_turn(pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.nda
     return None if motion is None else -float(np.angle(motion[1]))
 
 
+def ground_residual(pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarray) -> float | None:
+    """-> RMS distance of the points of a keyframe from those of the frame, after the best similarity [heights above
+    ground]. Otherwise as ``visual_motion``."""
+    points = _ground_points(pairs, before, now, r_b_c)
+    if points is None:
+        return None
+    kf, k = (one - one.mean() for one in points)
+    return float(np.sqrt(np.mean(np.abs(kf - similarity_ratio(k, kf) * k) ** 2)))
+
+
 def _ground_motion(
     pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarray
 ) -> tuple[complex, complex] | None:
     """-> displacement, and ratio of the points of the frame to those of the keyframe, as complex numbers east + j north
     in heights above ground."""
+    points = _ground_points(pairs, before, now, r_b_c)
+    if points is None:
+        return None
+    kf, k = points
+    ratio = _ratio(k, kf)
+    return complex(kf.mean() - ratio * k.mean()), ratio
+
+
+def _ground_points(
+    pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """-> where the rays of the keyframe and of the frame, complex (N,), meet the ground, east + j north from each
+    camera, in heights."""
     if len(pairs) < MIN_PAIRS:
         return None
     rays_kf, rays_k = (_rays(pairs[:, i : i + 2], a, r_b_c) for i, a in ((0, before), (2, now)))
@@ -60,8 +83,7 @@ def _ground_motion(
     if int(down.sum()) < MIN_PAIRS:
         return None
     kf, k = (rays[down, 0] / -rays[down, 2] + 1j * rays[down, 1] / -rays[down, 2] for rays in (rays_kf, rays_k))
-    ratio = _ratio(k, kf)
-    return complex(kf.mean() - ratio * k.mean()), ratio
+    return kf, k
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> complex:

@@ -16,6 +16,7 @@ from terrafix.core.geodesy import rot_w_b
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.monitors.calibration_monitors import FAULT_SIGMA_M, Monitors
 from terrafix.estimator.monitors.cusum import MARGIN, MAX_STEP, Cusum, threshold
+from terrafix.estimator.monitors.image_shape import ASPECT_RATIOS, ShapeMonitor
 from terrafix.estimator.monitors.inertial import MIN_CHANGE_MPS, MIN_WINDOW_S, MOUNT_YAWS_DEG, InertialMonitor
 from terrafix.estimator.monitors.map_offsets import OffsetMonitor, log_height_ratio
 from terrafix.estimator.monitors.registration import ERROR_PER_PATH, MIN_SPACING_HEIGHTS, PRIOR_WRONG, Registration
@@ -92,6 +93,47 @@ def test_the_visual_turn_does_not_depend_on_the_mount() -> None:
     pairs, before, now = _flown((0.0, 0.0), 0.2, mount_yaw_deg=180.0)
     seen = visual_motion(pairs, before, now, Mount().r_b_c())
     assert seen is not None and seen.turned_rad == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("ratio", [*ASPECT_RATIOS, 1.0])
+def test_turns_identify_an_image_whose_axes_have_two_scales(ratio: float) -> None:
+    """Turns of 15 degrees and 0.3 degrees of noise of the reported tilt."""
+    rng, monitor, r_b_c = np.random.default_rng(4), ShapeMonitor(), Mount().r_b_c()
+    for _ in range(40):
+        pairs, *attitudes = _flown((0.1, -0.2), math.radians(15.0))
+        before, now = (
+            replace(
+                one, roll_rad=one.roll_rad + rng.normal(0.0, 0.005), pitch_rad=one.pitch_rad + rng.normal(0.0, 0.005)
+            )
+            for one in attitudes
+        )
+        monitor.add(pairs * (ratio, 1.0, ratio, 1.0), before, now, r_b_c)
+    assert monitor.ratio == (None if ratio == 1.0 else ratio)
+
+
+def test_a_straight_flight_tells_nothing_of_the_two_scales_of_its_images() -> None:
+    monitor = ShapeMonitor()
+    for _ in range(1000):
+        pairs, before, now = _flown((0.1, -0.2), 0.0)
+        monitor.add(pairs * (0.75, 1.0, 0.75, 1.0), before, now, Mount().r_b_c())
+    assert monitor.ratio is None
+
+
+def test_a_flight_whose_images_are_squeezed_names_it_and_withdraws_the_position() -> None:
+    """A copter at 12 m/s that turns by 115 degrees between 15 and 17 s."""
+    flight, run = Flight(50, seed=3, turn_rad=2.0), EstimatorRun()
+    run.feed([ORIGIN])
+    for i in range(50):
+        squeezed = [_scaled_x(m, 0.75) if isinstance(m, Odometry) else m for m in flight.messages(i)]
+        run.feed([m for m in squeezed if not isinstance(m, MapMatch)])
+    faults = [(m.quantity, m.factor) for m in run.published if isinstance(m, CalibrationFault)]
+    assert ("aspect ratio", 0.75) in faults
+    assert sigma_m(run.estimate(49)) >= FAULT_SIGMA_M
+
+
+def _scaled_x(odometry: Odometry, factor: float) -> Odometry:
+    pairs = [(factor * a, b, factor * c, d) for a, b, c, d in odometry.two_view]
+    return msgspec.structs.replace(odometry, two_view=pairs)
 
 
 def test_without_a_heading_or_with_few_rays_there_is_no_visual_motion() -> None:

@@ -39,7 +39,10 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"height/focal seems x[\d.]+ off: no fix",
     r"(heading|mount yaw) off by -?\d+ deg: no fix",
     r"mirrored picture: no fix",
-    r"(scale|heading|mount yaw|mirrored picture) is plausible again",
+    r"picture squeezed by 1\.(19|33) in [xy]: no fix",
+    r"picture (upside down|mirrored|turned by -?90 deg): not used",
+    r"the picture is right again",
+    r"(scale|heading|mount yaw|mirrored picture|aspect ratio) is plausible again",
     r"autopilot (does not use the position|uses a position again)",
 ]
 
@@ -165,7 +168,15 @@ def test_named_values_are_sent_once_a_second_after_an_autopilot_is_connected() -
 
 @pytest.mark.parametrize(
     ("quantity", "factor"),
-    [("scale", 3.28), ("heading", -179.6), ("mount yaw", 180.0), ("mirrored picture", None), ("registration", None)],
+    [
+        ("scale", 3.28),
+        ("heading", -179.6),
+        ("mount yaw", 180.0),
+        ("mirrored picture", None),
+        ("registration", None),
+        ("aspect ratio", 0.75),
+        ("aspect ratio", 32 / 27),
+    ],
 )
 def test_a_calibration_fault_and_its_end_are_reported_to_the_pilot(quantity: str, factor: float | None) -> None:
     node = LinkNode(10.0)
@@ -174,3 +185,17 @@ def test_a_calibration_fault_and_its_end_are_reported_to_the_pilot(quantity: str
     began, ended = (message for message in published if isinstance(message, m.StatusText))
     assert is_known(began.text) and began.text.endswith("no fix") and began.severity == 2
     assert is_known(ended.text) and "no fix" not in ended.text and ended.severity == 6
+
+
+@pytest.mark.parametrize(
+    ("quantity", "factor"), [("picture upside down", None), ("picture turned", -90.0), ("picture mirrored", None)]
+)
+def test_a_picture_that_turns_in_flight_is_reported_to_the_pilot_as_not_used(
+    quantity: str, factor: float | None
+) -> None:
+    node = LinkNode(10.0)
+    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True)
+    published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
+    began, ended = (message for message in published if isinstance(message, m.StatusText))
+    assert is_known(began.text) and quantity in began.text and began.text.endswith("not used") and began.severity == 2
+    assert ended.text == "Terrafix: the picture is right again" and ended.severity == 6

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from pyproj import Transformer
 
 import map_rasters
+from map_geoids import undulation_m, write_geoid
 from terrafix.core.errors import MapError, UsageError
 from terrafix_tools.mapping.choices import Datum
 from terrafix_tools.mapping.package import heights
@@ -16,26 +16,11 @@ from terrafix_tools.mapping.package.heights import to_amsl
 HEIGHT_M = np.linspace(300.0, 900.0, 200 * 300, dtype=np.float32).reshape(1, 200, 300)
 
 
-def write_geoid(path: Path, west: float = 118.0, constant_m: float = 0.0) -> Path:
-    """N = constant + 10 m + 2 m per degree east of 120 + 3 m per degree north of 20; NOAA's .gtx format."""
-    lon_deg, lat_deg = np.meshgrid(west + 0.25 * np.arange(33), 18.0 + 0.25 * np.arange(33))
-    values = (constant_m + 10.0 + 2.0 * (lon_deg - 120.0) + 3.0 * (lat_deg - 20.0)).astype(">f4")
-    head = np.array([18.0, west, 0.25, 0.25], ">f8").tobytes() + np.array([33, 33], ">i4").tobytes()
-    path.write_bytes(head + values.tobytes())
-    return path
-
-
 def write_dem(path: Path) -> Path:
     """UTM zone 51, near 121 east, 23.5 north; a void in one corner."""
     height_m = HEIGHT_M.copy()
     height_m[0, :20, :30] = -9999.0
     return map_rasters.utm(path, height_m, pixel_m=30.0, nodata=-9999.0)
-
-
-def undulation_m(column: float, row: float, constant_m: float = 0.0) -> float:
-    x, y = 300_000.0 + 30.0 * (column + 0.5), 2_600_000.0 - 30.0 * (row + 0.5)
-    lon_deg, lat_deg = Transformer.from_crs(32651, 4326, always_xy=True).transform(x, y)
-    return constant_m + 10.0 + 2.0 * (lon_deg - 120.0) + 3.0 * (lat_deg - 20.0)
 
 
 def test_ellipsoidal_heights_are_reduced_by_the_undulation(tmp_path: Path) -> None:

@@ -97,3 +97,9 @@ def test_faults_in_turn_follow_each_other() -> None:
     assert not [t_s for t_s in times_s if 0.0 <= t_s - flown.lie.from_s < 6.0]
     held = {flown.pictures[i].p_m.tobytes() for i, t_s in enumerate(times_s) if 7.0 < t_s - flown.lie.from_s < 21.0}
     assert len(held) == 1
+
+
+def test_outlier_fixes_of_the_table_are_rejected_by_the_estimator() -> None:
+    honest, wrong = run(TRUE), run(plan(5, 1, fault="350 m outlier fix", duration_s=SHORT_S))
+    assert wrong.fixes.get(Verdict.INNOVATION, 0) >= honest.fixes.get(Verdict.INNOVATION, 0) + 5
+    assert np.hypot(*wrong.error_m[:, :2].T).max() < 60.0

@@ -23,7 +23,7 @@ from terrafix.estimator.filter_state import FrameInput
 from terrafix.estimator.graph.marginalized import MarginalizedHistory
 from terrafix.estimator.graph.pose_graph import PoseGraph
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
-from terrafix.messages import Imu
+from terrafix.messages import Imu, VehicleState
 from terrafix_lab.bench.growth.stream import frame_messages, origin
 from terrafix_tools.replay import peak_memory_mb
 from terrafix_tools.timing import spread
@@ -133,7 +133,7 @@ def _flown(estimator: Estimator, frames: int) -> Iterator[float]:
         for message in frame.telemetry:
             if isinstance(message, Imu):
                 telemetry.add_imu(message)
-            else:
+            elif isinstance(message, VehicleState):
                 telemetry.add(message)
         t_ns = frame.odometry.t_ns
         attitude = telemetry.at(t_ns)

@@ -108,9 +108,8 @@ class AutopilotPeer:
             with contextlib.suppress(OSError):
                 self._socket.sendto(data, self._companion)
 
-    def edit_telemetry(self, edit: Edit | None) -> None:
-        """From now on attitude, heading and height pass through ``edit``, on the monotonic clock; None: they are as
-        measured."""
+    def edit_telemetry(self, edit: Edit) -> None:
+        """From now on attitude, heading and height pass through ``edit``, on the monotonic clock."""
         self._sensors.alter(edit, self._started_s)
 
     def reboot(self) -> None:

@@ -17,8 +17,10 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix_lab.sim.ground.relief import Relief
 from terrafix_lab.sim.ground.tiles import TILE_PX, Make, Pyramid, blank, of_array, outside
 from terrafix_lab.sim.ground.warp import Warp, fit
+from terrafix_tools.mapping.datum import crs_of
 from terrafix_tools.mapping.package.dem import PLAUSIBLE_M
-from terrafix_tools.mapping.source import ImagerySource, crs_of, open_raster
+from terrafix_tools.mapping.package.height_values import check_amsl, heights_of
+from terrafix_tools.mapping.source import ImagerySource, open_raster
 
 MAX_POSTS = 4096  # of a side; a finer elevation model is averaged down to 64 MB
 DEM_MARGIN_M = 2000.0  # beyond the image: hills there do not occlude it but appear in oblique views
@@ -101,6 +103,8 @@ def _read_relief(path: Path, source: ImagerySource, frame: LocalFrame) -> Relief
     """Reads the part of an elevation file under and around the image. Raises MapError."""
     with open_raster(path) as file:
         crs = crs_of(file, path)
+        heights = heights_of(file, str(path))
+        check_amsl(heights, path)
         window = _dem_window(file, crs, source)
         if window is None:
             raise MapError(f"{path}: no elevation under {source.path}; give a DEM that covers it")
@@ -113,6 +117,7 @@ def _read_relief(path: Path, source: ImagerySource, frame: LocalFrame) -> Relief
         amsl_m = (
             band.filled(np.nan).astype(np.float32) if band.dtype.kind == "f" else band.astype(np.float32).filled(np.nan)
         )
+        amsl_m = heights.to_m(amsl_m)
         a = file.transform
     west, north = a.a * window.col_off + a.b * window.row_off + a.c, a.d * window.col_off + a.e * window.row_off + a.f
     corner = Affine(a.a, a.b, west, a.d, a.e, north)

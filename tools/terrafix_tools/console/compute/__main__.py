@@ -88,6 +88,8 @@ class FlightProcess:
         self._say(f"frame {frame_id}")
 
     def _wait(self) -> None:
+        if (outcome := self._observer.images_through()) is not None and outcome.request is not None:
+            self._store(f"asked {outcome.request.request_id}", outcome)
         self._say("waiting")
         if not sys.stdin.readline():
             raise SystemExit(0)

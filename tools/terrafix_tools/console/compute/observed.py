@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from terrafix.core.gate import CHI2_95
+from terrafix.link.ground_station.prior_request import MIN_FRAMES
 from terrafix.messages import (
     Frame,
     HintVerdict,
@@ -41,6 +42,7 @@ from terrafix_tools.estimates import yaw_deg_of
 
 NEAR_M = 20.0  # of the position, within which `confidence` is the probability [spec: AC-1 of the requirements]
 LOST_REASON = "the position is lost and the whole map was searched; a user fix or a hint would help"
+THROUGH_REASON = "all images are computed and the position is not found; a user fix or a hint would help"
 
 
 @dataclass
@@ -78,6 +80,7 @@ class FlightObserver:
         self._fragments: dict[int, Fragment] = {}
         self._state = FlightState.PROCESSING
         self._asked = False
+        self._lost_frames = 0  # in a row
         self._requests = 0
         self._request: InputRequest | None = None
         self._reached: tuple[str, int | None] | None = None  # of the search
@@ -197,6 +200,7 @@ class FlightObserver:
     def _search_events(self, found: MapMatch, frame_id: int) -> list[Event]:
         """Changes of the search and of the state of the flight with the match of the newest frame."""
         events: list[Event] = []
+        self._lost_frames = self._lost_frames + 1 if found.verdict is Verdict.LOST else 0
         if found.verdict is Verdict.LOST:
             self._asked |= found.search.step is SearchStep.ASK
             reached: tuple[str, int | None] = "whole_map", None
@@ -206,7 +210,7 @@ class FlightObserver:
                 events.append(SearchExpanded(frame_id=frame_id, grid_size=reached[1], status=reached[0]))
                 self._reached = reached
             if self._asked and self._request is None:
-                events += self._ask(frame_id)
+                events += self._ask(frame_id, LOST_REASON)
         elif self._reached is not None:
             events.append(SearchExpanded(frame_id=frame_id, grid_size=self._reached[1], status="found"))
             self._reached, self._asked, self._request, self._places = None, False, None, None
@@ -217,7 +221,18 @@ class FlightObserver:
             self._state = state
         return events
 
-    def _ask(self, frame_id: int) -> list[Event]:
+    def images_through(self) -> FrameOutcome | None:
+        """All images so far are computed. -> a request for a position, if it is lost and none was asked for; else
+        None."""
+        if self._lost_frames < MIN_FRAMES or self._asked or self._shown is None:
+            return None
+        self._asked = True
+        events = self._ask(self._shown.frame_id, THROUGH_REASON)
+        events.append(StateChanged(state=FlightState.BLOCKED, previous=self._state))
+        self._state = FlightState.BLOCKED
+        return self._outcome(events)
+
+    def _ask(self, frame_id: int, reason: str) -> list[Event]:
         self._requests += 1
         self._request = InputRequest(request_id=f"r{self._requests}", frame_id=frame_id)
         return [
@@ -227,7 +242,7 @@ class FlightObserver:
                 image_url=self._image_url(frame_id),
                 candidate_tiles=[] if self._places is None else _tiles(self._places),
             ),
-            ProcessingBlocked(reason=LOST_REASON, frame_id=frame_id),
+            ProcessingBlocked(reason=reason, frame_id=frame_id),
         ]
 
     def _answer(self, message: HintVerdict) -> HintAnswered:

@@ -12,16 +12,20 @@ import msgspec
 from rich.console import Console
 
 from terrafix.core.errors import MapError, OutputError, UsageError
+from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.area.checks import check_area
 from terrafix_tools.mapping.area.files import DEFAULT_BUFFER_KM, is_line, read_area
 from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.build import build_package, layer_of
-from terrafix_tools.mapping.choices import Datum, Descriptors
+from terrafix_tools.mapping.choices import Datum, Descriptors, Unit
+from terrafix_tools.mapping.datum import crs_of
 from terrafix_tools.mapping.fetching.progress import shown
 from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
 from terrafix_tools.mapping.orthomosaic.write import read_statement
 from terrafix_tools.mapping.package.dem import DemSource
+from terrafix_tools.mapping.package.height_values import height_statement, heights_of
 from terrafix_tools.mapping.package.heights import to_amsl
+from terrafix_tools.mapping.source import open_raster
 from terrafix_tools.mapping.sources.copernicus import glo30
 from terrafix_tools.mapping.sources.prepare import Preparation, Request
 from terrafix_tools.mapping.sources.spec import SourceSpec, parse_sources, read_sources
@@ -48,7 +52,8 @@ class Order:
     sources: Path | None = None
     gsd_m: float | None = None
     dem: str = ""
-    dem_datum: Datum = Datum.EGM96
+    dem_datum: Datum | None = None  # None: as the file says
+    dem_unit: Unit | None = None
     geoid: Path | None = None
     osm: str = ""
     osm_ce90_m: float | None = None
@@ -95,7 +100,7 @@ def build_order(order: Order) -> Path | None:
         scratch = stack.enter_context(made)
         elevation = _elevation(order, area, Path(scratch))
         vectors = _vectors(order, area)
-        return build_package(
+        package = build_package(
             layers,
             order.out,
             elevation=elevation,
@@ -106,6 +111,11 @@ def build_order(order: Order) -> Path | None:
             cluster=cluster,
             progress=True,
         )
+    opened = MapPackage.open(package)
+    for statement in opened.manifest.inputs:
+        order.say.print(statement.text(), highlight=False)
+    opened.close()
+    return package
 
 
 def _check_files(order: Order) -> None:
@@ -134,6 +144,8 @@ def _layers(order: Order, area: Area) -> list[LayerInput] | None:
     specs = _specs(order)
     size_km2 = check_area(area)
     order.say.print(f"{area.name}: {size_km2:,.1f} km2 with its buffer", highlight=False)
+    for note in area.notes:
+        order.say.print(f"{area.name}: {note}", highlight=False)
     if order.buffer_km is None and order.corridor_km is None:
         order.say.print(_area_hint(order.area), highlight=False)
     preparation = Preparation(Request(area, specs, order.cache_dir, order.out, order.gsd_m), order.say)
@@ -191,10 +203,15 @@ def _elevation(order: Order, area: Area | None, scratch: Path) -> ElevationInput
         datum, licence = Datum.EGM2008, glo30.LICENCE
         with shown(order.say, glo30.NAME) as on_progress:
             path = glo30.fetch_glo30(area, order.cache_dir, on_progress)
-    used, note = to_amsl(path, datum, scratch / "amsl.tif", order.geoid)
-    if datum is not Datum.EGM96:
-        order.say.print(f"{order.dem}: {note}", highlight=False)
-    return ElevationInput(partial(DemSource, used.absolute()), source=path.name, licence=licence)
+    used, note = to_amsl(path, datum, scratch / "amsl.tif", order.geoid, order.dem_unit)
+    with open_raster(path) as file:
+        heights, crs = heights_of(file, str(path), order.dem_unit, datum), crs_of(file, path)
+        centre = file.transform @ (file.width / 2, file.height / 2)
+        done = "" if heights.datum is Datum.EGM96 else note
+        statement = height_statement(file, path, heights, crs, centre, done)
+    unit = order.dem_unit if used == path else None
+    opener = partial(DemSource, used.absolute(), unit=unit, datum=datum or Datum.EGM96)
+    return ElevationInput(opener, source=path.name, licence=licence, statement=statement)
 
 
 def _vectors(order: Order, area: Area | None) -> VectorInput | None:

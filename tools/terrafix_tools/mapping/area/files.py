@@ -1,10 +1,9 @@
 """Reads the area of a map: a box, KML, GeoJSON, or a ground station mission, with a buffer around it.
 
-Formats: OGC KML 2.3 (12-007r2), GeoJSON (RFC 7946); missions as in `mission/file.py`."""
+Formats: GeoJSON (RFC 7946); KML as in `kml.py`, missions as in `mission/file.py`."""
 
 import json
 import re
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,16 @@ import numpy as np
 from terrafix.core.errors import SourceError, UsageError
 from terrafix_tools.mapping.area.buffer import around_line, around_ring
 from terrafix_tools.mapping.area.checks import check_points, check_ring
+from terrafix_tools.mapping.area.kml import SUFFIXES as KML
+from terrafix_tools.mapping.area.kml import kml_shapes
 from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mission.file import read_mission
+from terrafix_tools.text_file import decode_text
 
 DEFAULT_BUFFER_KM = 20.0  # allows for a vehicle that arrives from anywhere or is blown off its path
 MISSIONS = (".plan", ".waypoints", ".mission", ".txt")
 BOX = re.compile(r"\s*" + r"\s*,\s*".join([r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"] * 4) + r"\s*")
-KNOWN = "a box W,S,E,N in degrees, a .kml, a .geojson, a QGroundControl .plan or an ArduPilot waypoint file"
+KNOWN = "a box W,S,E,N in degrees, a .kml or .kmz, a .geojson, a QGroundControl .plan or an ArduPilot waypoint file"
 
 Outline = tuple[bool, np.ndarray]  # (polygon, else line; (n, 2) lon, lat)
 
@@ -35,7 +37,7 @@ def read_area(text: str, *, buffer_km: float | None = None, corridor_km: float |
     for option, value in (("--buffer", buffer_km), ("--corridor", corridor_km)):
         if value is not None and not 0.0 <= value <= 200.0:
             raise UsageError(f"{option} {value:g}: give kilometres between 0 and 200")
-    outlines = _read(text)
+    outlines, notes = _read(text)
     if corridor_km is not None and all(closed for closed, _ in outlines):
         raise UsageError(f"{text}: neither a mission nor a line, which --corridor needs; give --buffer")
     distance_m = 1000.0 * next(v for v in (corridor_km, buffer_km, DEFAULT_BUFFER_KM) if v is not None)
@@ -44,39 +46,46 @@ def read_area(text: str, *, buffer_km: float | None = None, corridor_km: float |
         if not closed and distance_m <= 0.0:
             raise UsageError(f"{text}: a line without width is no area; give --corridor KM, for example 2")
         rings += around_ring(points, distance_m) if closed else around_line(points, distance_m)
-    return Area(_name(text), tuple(rings))
+    return Area(_name(text), tuple(rings), notes)
 
 
 def is_line(text: str) -> bool:
     """True when the text names a mission or a line, for which a corridor is possible. Raises as `read_area`."""
-    return not all(closed for closed, _ in _read(text))
+    return not all(closed for closed, _ in _read(text)[0])
 
 
 def _name(text: str) -> str:
     return f"box {text}" if BOX.fullmatch(text) else Path(text).name
 
 
-def _read(text: str) -> list[Outline]:
+def _read(text: str) -> tuple[list[Outline], tuple[str, ...]]:
+    """The outlines, and notes about the file."""
     box = BOX.fullmatch(text)
     if box:
-        return [(True, _box(text, *(float(v) for v in box.groups())))]
+        return [(True, _box(text, *(float(v) for v in box.groups())))], ()
     path = Path(text)
     suffix = path.suffix.lower()
-    if suffix not in (".kml", ".geojson", ".json", *MISSIONS):
-        hint = "; unzip it first, the area is its doc.kml" if suffix == ".kmz" else ""
-        raise UsageError(f"--area {text}: give {KNOWN}{hint}")
+    if suffix not in (*KML, ".geojson", ".json", *MISSIONS):
+        raise UsageError(f"--area {text}: give {KNOWN}")
     if suffix in MISSIONS:
-        return [(False, _mission(path))]
+        return _mission(path)
+    notes: tuple[str, ...] = ()
     try:
-        content = path.read_text(encoding="utf-8-sig")
+        data = path.read_bytes()
+        if suffix in KML:
+            shapes, notes = kml_shapes(path, data)
+            outlines = [
+                _outline(f"{path} {kind} {i}", closed, points) for i, (closed, kind, points) in enumerate(shapes, 1)
+            ]
+        else:
+            outlines = _geojson(path, decode_text(data))
     except FileNotFoundError:
         raise UsageError(f"{path}: no such file; check --area") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: cannot be read as an area ({error}); save it as text in UTF-8") from None
-    outlines = _kml(path, content) if suffix == ".kml" else _geojson(path, content)
     if not outlines:
         raise UsageError(f"{path}: contains no polygon and no line; draw the area as a polygon and save it again")
-    return outlines
+    return outlines, notes
 
 
 def _box(text: str, west: float, south: float, east: float, north: float) -> np.ndarray:
@@ -89,43 +98,16 @@ def _box(text: str, west: float, south: float, east: float, north: float) -> np.
     return corners
 
 
-def _mission(path: Path) -> np.ndarray:
+def _mission(path: Path) -> tuple[list[Outline], tuple[str, ...]]:
     """Home and every position of a mission in order, (n, 2) lon, lat."""
-    mission = read_mission(path)
+    mission = read_mission(path, course_only=True)
     placed = [(i.lon_deg, i.lat_deg) for i in mission.items if i.lon_deg is not None and i.lat_deg is not None]
     home = (mission.home_lon_deg, mission.home_lat_deg)
     points = np.array([*([home] if home != (0.0, 0.0) else []), *placed], float).reshape(-1, 2)
     if not len(points):
         raise SourceError(f"{path}: no item of this mission has a position; a map needs at least one")
     check_points(str(path), points)
-    return points
-
-
-def _kml(path: Path, content: str) -> list[Outline]:
-    """Outer boundaries and lines at any depth; holes count as area, because a vehicle may cross them."""
-    try:
-        root = ElementTree.fromstring(content)
-    except ElementTree.ParseError as error:
-        raise UsageError(f"{path}: not valid XML ({error}); export the area as KML again") from None
-    outlines: list[Outline] = []
-    for element in root.iter():
-        kind = element.tag.rpartition("}")[2]
-        if kind not in ("Polygon", "LineString"):
-            continue
-        where = f"{path} {kind} {len(outlines) + 1}"
-        within = element.find("{*}outerBoundaryIs") if kind == "Polygon" else element
-        node = None if within is None else within.find(".//{*}coordinates")
-        points = _kml_points(where, "" if node is None else node.text or "")
-        outlines.append(_outline(where, kind == "Polygon", points))
-    return outlines
-
-
-def _kml_points(where: str, text: str) -> np.ndarray:
-    """ "lon,lat[,height] lon,lat ..." -> (n, 2)."""
-    try:
-        return np.array([[float(v) for v in tuple_.split(",")[:2]] for tuple_ in text.split()], float).reshape(-1, 2)
-    except ValueError:
-        raise UsageError(f"{where}: its coordinates are no numbers; export the area again") from None
+    return [(False, points)], mission.notes
 
 
 def _geojson(path: Path, content: str) -> list[Outline]:

@@ -17,10 +17,12 @@ SIZE_GRID_PX = 1500  # side of the raster that measures the size of a union; acc
 
 @dataclass(frozen=True, eq=False)
 class Area:
-    """``rings``: each (n, 2) longitude and latitude in degrees, not closed; the area is their union without holes."""
+    """``rings``: each (n, 2) longitude and latitude in degrees, not closed; the area is their union without holes.
+    ``notes``: what of its file was assumed or left out, a line each."""
 
     name: str
     rings: tuple[np.ndarray, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:

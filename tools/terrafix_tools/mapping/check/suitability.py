@@ -76,6 +76,7 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     expected_error_m: float  # horizontal median where the ground is matchable
     ce90_m: float
     ce90_origin: Ce90Origin
+    inputs: list[str]  # unit, datum and accuracy of each input of the package, and what was assumed about it
     warnings: list[str]
     mission: MissionCheck | None
 
@@ -103,7 +104,7 @@ def check(
     """Checks the whole map and the mission. Raises MapError, SourceError (mission or camera), UsageError."""
     found = package.layer(layer)
     lens, lens_name = _camera(camera)
-    plan = read_mission(mission) if mission else None
+    plan = read_mission(mission, course_only=True) if mission else None
     agl_m = _flight_height_m(agl_m, plan)
     west, south, east, north = package.manifest.bounds_wgs84
     frame = LocalFrame((south + north) / 2, (west + east) / 2)
@@ -143,9 +144,11 @@ def check(
         expected_error_m=MEDIAN_SIGMAS * math.hypot(accuracy.sigma_m, MATCH_CELLS * cell_m / MEDIAN_SIGMAS),
         ce90_m=accuracy.ce90_m,
         ce90_origin=accuracy.origin,
+        inputs=[statement.text() for statement in package.manifest.inputs],
         warnings=[
             *_warnings(found, int(min(frame_m) / cell_m), package.manifest.has_dem, cell_m, agl_m),
             *_search_warnings(local, matcher, agl_m),
+            *([f"{plan.name}: {note}" for note in plan.notes] if plan else []),
         ],
         mission=mission_check,
     )
@@ -211,6 +214,10 @@ def _warnings(layer: Layer, frame_cells: int, has_elevation: bool, cell_m: float
         )
     if not has_elevation:
         warnings.append("no elevation: the ground is taken for flat; over hills build the package with --dem")
+    if layer.ce90_origin is Ce90Origin.DATUM:
+        warnings.append(
+            f"the map's own accuracy is not stated; {layer.ce90_m:g} m (CE90) is that of its datum's way to WGS 84"
+        )
     if layer.ce90_m is None:
         warnings.append(f"the map's own accuracy is not stated; {Map().ce90_m:.0f} m (CE90) is assumed")
     return warnings

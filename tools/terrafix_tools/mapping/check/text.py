@@ -38,6 +38,7 @@ def lines_of(report: MapCheck) -> list[tuple[str, str]]:
             "elsewhere it grows with the distance flown",
         )
     )
+    rows += [("input", text) for text in report.inputs]
     return rows + [("note", text) for text in report.warnings]
 
 

@@ -53,7 +53,7 @@ def with_estimates(layers: Sequence[Layer], offsets: Offsets) -> tuple[Layer, ..
         for pair, offset in offsets.items():
             if i in pair and accuracies[i].origin is Ce90Origin.DEFAULT:
                 other = accuracies[pair[1 - pair.index(i)]]
-                given = by_stated if other.origin is Ce90Origin.STATED else by_default
+                given = by_default if other.origin is Ce90Origin.DEFAULT else by_stated
                 given.append(given_offset(offset, accuracies[i], other))
         if by_stated or by_default:
             ce90_m = min(by_stated) if by_stated else max(by_default)
@@ -65,7 +65,7 @@ def with_estimates(layers: Sequence[Layer], offsets: Offsets) -> tuple[Layer, ..
 def given_offset(offset: Offset, own: Accuracy, other: Accuracy) -> float:
     """CE90 in metres of a layer without stated accuracy, from its offset to another one."""
     apart_m2 = (offset.east_m**2 + offset.north_m**2) / 2.0  # per axis
-    if other.origin is Ce90Origin.STATED:
+    if other.origin is not Ce90Origin.DEFAULT:
         known_m2 = other.sigma_m**2 + offset.sigma_m**2
         least_m2 = min(own.sigma_m**2, other.sigma_m**2)
         own_m2 = max(own.sigma_m**2, apart_m2 - known_m2)

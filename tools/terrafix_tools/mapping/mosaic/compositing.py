@@ -10,6 +10,7 @@ import numpy as np
 from pyproj import CRS
 from rasterio.transform import Affine
 
+from terrafix.map.format import InputStatement
 from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.layers import Imagery
 from terrafix_tools.mapping.mosaic.grid import Grid
@@ -42,8 +43,8 @@ class Mosaic:
         self._placed = Placed(plan.area, self.crs)
         self._open = contextlib.ExitStack()
         with self._open:  # closes the open sources when a later one fails to open
-            parts = [self._open.enter_context(part()) for part in plan.parts]
-            self._parts = [Warped(part, grid, self.crs) for part in parts]
+            self._sources = [self._open.enter_context(part()) for part in plan.parts]
+            self._parts = [Warped(part, grid, self.crs) for part in self._sources]
             self._open = self._open.pop_all()
 
     def __enter__(self) -> "Mosaic":
@@ -53,6 +54,10 @@ class Mosaic:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._open.close()
+
+    @property
+    def statements(self) -> tuple[InputStatement, ...]:
+        return tuple(statement for part in self._sources for statement in part.statements)
 
     @property
     def gsd_m(self) -> float:

@@ -1,4 +1,4 @@
-"""Elevation for a map package: a raster of metres AMSL, resampled to the map's CRS in 16-bit tiles."""
+"""Elevation for a map package: a raster of heights AMSL, resampled to the map's CRS in 16-bit tiles of metres."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -18,10 +18,13 @@ from rasterio.windows import Window
 
 from terrafix.core.errors import MapError
 from terrafix.map.format import DEM_NULL, DEM_TILE_PX, DemGrid, Level
+from terrafix_tools.mapping.choices import Datum, Unit
+from terrafix_tools.mapping.datum import crs_of
 from terrafix_tools.mapping.layers import Bounds, Elevation, ElevationInput
 from terrafix_tools.mapping.package.gpkg import GpkgWriter
+from terrafix_tools.mapping.package.height_values import check_amsl, height_statement, heights_of
 from terrafix_tools.mapping.package.pyramid import Place
-from terrafix_tools.mapping.source import SAMPLE_PX, crs_of, ground_distance_m, ground_pixel_m, open_raster
+from terrafix_tools.mapping.source import SAMPLE_PX, ground_distance_m, ground_pixel_m, holds, open_raster
 
 PLAUSIBLE_M = (-500.0, 9000.0)  # the Dead Sea's shore is at -430 m, Everest at 8849 m; other values are voids
 FINEST_M = 1.0  # a finer grid adds megabytes without accuracy
@@ -37,14 +40,20 @@ TILES_PER_WORKER = (
 class DemSource:
     """Elevation on a square north-up grid in the map's CRS, from any GDAL raster. A context manager.
 
-    Raises MapError: not a raster, not georeferenced, or not near the map."""
+    ``unit``, ``datum``: as the user states them. Raises MapError: not a raster, not georeferenced, not near the map, of
+    unknown unit, or counted from the ellipsoid and not stated to be otherwise."""
 
-    def __init__(self, path: Path, crs: CRS, bounds: Bounds) -> None:
+    def __init__(
+        self, path: Path, crs: CRS, bounds: Bounds, *, unit: Unit | None = None, datum: Datum | None = None
+    ) -> None:
         self.path = path
         self._file = open_raster(path)
         if self._file.count >= 3:  # a second band may be alpha
             raise MapError(f"{path}: has {self._file.count} bands, elevation has one; give a DEM")
         dem_crs = crs_of(self._file, path)
+        self.heights = heights_of(self._file, str(path), unit, datum)
+        if datum is None:
+            check_amsl(self.heights, path)
         x_min, y_min, x_max, y_max = bounds
         x_mid, y_mid = (x_min + x_max) / 2, (y_min + y_max) / 2
         unit_m = ground_pixel_m(crs, x_mid, y_mid, 1.0, 1.0)
@@ -58,6 +67,8 @@ class DemSource:
             width_px=math.ceil((x_max - x_min + 2 * margin) / pixel) + 1,
             height_px=math.ceil((y_max - y_min + 2 * margin) / pixel) + 1,
         )
+        centre = self._file.transform @ (self._file.width / 2, self._file.height / 2)
+        self.statement = height_statement(self._file, path, self.heights, dem_crs, centre)
         level = level_of(self.grid)
         self._data = WarpedVRT(
             self._file,
@@ -85,7 +96,7 @@ class DemSource:
         """Same contract as ``Elevation``. Raises MapError: the file is damaged."""
         window = Window(column * DEM_TILE_PX, row * DEM_TILE_PX, DEM_TILE_PX, DEM_TILE_PX)
         try:
-            return self._data.read(1, window=window)
+            return self.heights.to_m(self._data.read(1, window=window))
         except RasterioError as error:
             raise self._unreadable(error) from None
 
@@ -105,7 +116,7 @@ class DemSource:
 
     def _void_value(self) -> float | None:
         """The nodata value, declared or not: an implausible value that the file uses (-9999, -32768)."""
-        if self._file.nodata is not None:
+        if self._file.nodata is not None and holds(self._file.dtypes[0], self._file.nodata):
             return float(self._file.nodata)
         shrink = max(1.0, max(self._file.width, self._file.height) / SAMPLE_PX)
         shape = (max(1, int(self._file.height / shrink)), max(1, int(self._file.width / shrink)))
@@ -113,7 +124,8 @@ class DemSource:
             sample = self._file.read(1, out_shape=shape)
         except RasterioError as error:
             raise self._unreadable(error) from None
-        wrong = sample[np.isfinite(sample) & ((sample < PLAUSIBLE_M[0]) | (sample > PLAUSIBLE_M[1]))]
+        height_m = self.heights.to_m(sample)
+        wrong = sample[np.isfinite(sample) & ((height_m < PLAUSIBLE_M[0]) | (height_m > PLAUSIBLE_M[1]))]
         if wrong.size == 0:
             return None
         values, counts = np.unique(wrong, return_counts=True)

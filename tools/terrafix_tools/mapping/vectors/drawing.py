@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from pyproj import CRS, Transformer
 
+from terrafix.map.format import InputStatement
 from terrafix.map.vectors import wkb_parts
 from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.layers import Feature, LayerInput, VectorInput
@@ -121,6 +122,7 @@ class Drawing:
     """Implements Imagery: what ``spooled`` has written to ``folder``, on a grid. A context manager."""
 
     has_mask = True
+    statements: tuple[InputStatement, ...] = ()
 
     def __init__(self, folder: Path, grid: Grid) -> None:
         self.crs = CRS.from_user_input(grid.crs)

@@ -1,6 +1,7 @@
 """Local tile files: MBTiles (1.3, also the format of the download store) and PMTiles (version 3)."""
 
 import gzip
+import math
 import mmap
 import sqlite3
 import struct
@@ -23,12 +24,17 @@ from pmtiles.tile import (
 )
 
 from terrafix.core.errors import MapError
-from terrafix_tools.mapping.sources.tiles.grid import Tile
+from terrafix_tools.mapping.sources.tiles.grid import MAX_ZOOM, Tile
 from terrafix_tools.mapping.sources.tiles.store import mbtiles_row
 
+# SQLite's message about a damaged file may quote its bytes, which then are not valid UTF-8; a length in it may be more
+# than there is memory.
+DATABASE_ERRORS = (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError)
 PICTURES = (TileType.PNG, TileType.JPEG, TileType.WEBP)
 DIRECTORIES = 64  # decompressed directories of a PMTiles file in the cache
 HEADER_BYTES = 127
+MERCATOR_END_DEG = 85.051129  # latitude at which the square of Web Mercator ends
+FITS = 0.5  # share of common rows; of a wrong reading it is zero but near the equator
 MAX_DIRECTORY_DEPTH = 4  # maximum depth; a PMTiles directory is at most three levels below the root
 
 
@@ -41,17 +47,52 @@ class MbtilesReader:
             self._db = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)
             self._close = weakref.finalize(self, self._db.close)  # also of a file that is refused below
             rows = self._db.execute("SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level").fetchall()
-        except sqlite3.DatabaseError as error:
+        except DATABASE_ERRORS as error:
             raise MapError(f"{path}: not an MBTiles file ({error}); check the source") from None
-        self.zooms = [int(row[0]) for row in rows]
+        self.zooms = [row[0] for row in rows]
         if not self.zooms:
             raise MapError(f"{path}: holds no tile; check the source")
+        if not all(isinstance(zoom, int) and 0 <= zoom <= MAX_ZOOM for zoom in self.zooms):
+            raise MapError(f"{path}: a zoom level of it is none of 0 to {MAX_ZOOM}; check the source")
+        self.from_north, self.notes = self._rows()
+
+    def _rows(self) -> tuple[bool, tuple[str, ...]]:
+        """Whether its rows count from the north, against the specification, and a word about it.
+
+        Of its bounds that reading is taken which they fit; without bounds the key `scheme` that some programs write."""
+        zoom = self.zooms[-1]
+        query = "SELECT MIN(tile_row), MAX(tile_row) FROM tiles WHERE zoom_level = ?"
+        try:
+            low, high = self._db.execute(query, (zoom,)).fetchone()
+            metadata = self._metadata()
+        except DATABASE_ERRORS as error:
+            raise MapError(f"{self.path}: damaged ({error}); copy or download it again") from None
+        if not isinstance(low, int) or not isinstance(high, int) or not 0 <= low <= high < 1 << zoom:
+            raise MapError(f"{self.path}: a row of its tiles is none of zoom {zoom}; check the source")
+        says_north = metadata.get("scheme", "").strip().lower() in ("xyz", "zxy")
+        expected = _rows_of_bounds(metadata.get("bounds", ""), zoom)
+        if expected is None:
+            return says_north, ("rows count from the north, as its scheme says",) if says_north else ()
+        south = _overlap((mbtiles_row(zoom, high), mbtiles_row(zoom, low)), expected)
+        north = _overlap((low, high), expected)
+        if max(south, north) < FITS:
+            return False, ("its bounds contradict its rows; rows count from the south, as specified",)
+        if north >= FITS and (south < FITS or says_north):
+            return True, ("rows count from the north, against the specification: so its bounds fit",)
+        return False, ()
+
+    def _metadata(self) -> dict[str, str]:
+        """Empty without the table."""
+        if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'metadata'").fetchone():
+            return {}
+        return {str(name): str(value) for name, value in self._db.execute("SELECT name, value FROM metadata")}
 
     def get(self, tile: Tile) -> bytes | None:
         query = "SELECT CAST(tile_data AS BLOB) FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
         try:
-            found = self._db.execute(query, (tile.zoom, tile.column, mbtiles_row(tile.zoom, tile.row))).fetchone()
-        except sqlite3.DatabaseError as error:
+            row = tile.row if self.from_north else mbtiles_row(tile.zoom, tile.row)
+            found = self._db.execute(query, (tile.zoom, tile.column, row)).fetchone()
+        except DATABASE_ERRORS as error:
             raise MapError(f"{self.path}: damaged near tile {tile} ({error}); copy or download it again") from None
         return found[0] if found else None
 
@@ -60,7 +101,7 @@ class MbtilesReader:
         query = "SELECT CAST(tile_data AS BLOB) FROM tiles WHERE zoom_level = ? AND length(tile_data) > 0 LIMIT 1"
         try:
             found = self._db.execute(query, (zoom,)).fetchone()
-        except sqlite3.DatabaseError as error:
+        except DATABASE_ERRORS as error:
             raise MapError(f"{self.path}: damaged ({error}); copy or download it again") from None
         return bytes(found[0]) if found else b""
 
@@ -68,8 +109,31 @@ class MbtilesReader:
         self._close()
 
 
+def _rows_of_bounds(text: str, zoom: int) -> tuple[int, int] | None:
+    """First and last row, counted from the north, of "W,S,E,N" in degrees; None: no bounds."""
+    try:
+        _, south_deg, _, north_deg = (float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    if not -90.0 <= south_deg < north_deg <= 90.0:
+        return None
+    rows = []
+    for lat_deg in (north_deg, south_deg):
+        lat = math.radians(min(max(lat_deg, -MERCATOR_END_DEG), MERCATOR_END_DEG))
+        rows.append((1.0 - math.asinh(math.tan(lat)) / math.pi) / 2.0 * (1 << zoom))
+    return math.floor(rows[0]), max(math.ceil(rows[1]) - 1, math.floor(rows[0]))
+
+
+def _overlap(a: tuple[int, int], b: tuple[int, int]) -> float:
+    """Common rows of two ranges, as a share of the shorter one."""
+    common = min(a[1], b[1]) - max(a[0], b[0]) + 1
+    return common / min(a[1] - a[0] + 1, b[1] - b[0] + 1)
+
+
 class PmtilesReader:
     """Caches decompressed directories; the library's own reader decompresses them for every tile."""
+
+    notes: tuple[str, ...] = ()
 
     def __init__(self, path: Path) -> None:
         self.path = path

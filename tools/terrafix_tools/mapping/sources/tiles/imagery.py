@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from terrafix.core.errors import MapError
+from terrafix.map.format import InputStatement
 from terrafix_tools.mapping.area.polygons import Placed
 from terrafix_tools.mapping.source import ground_pixel_m
 from terrafix_tools.mapping.sources.tiles.grid import HALF_M, MERCATOR, Tile, tile_span_m, tiles_of
@@ -20,6 +21,7 @@ class TileReader(Protocol):
     """Source of tiles: a download store, an MBTiles or a PMTiles file."""
 
     path: Path
+    notes: tuple[str, ...]  # what was assumed about the file
 
     def get(self, tile: Tile) -> bytes | None: ...
 
@@ -41,6 +43,12 @@ class TileImagery:
         self.pixel_x = self.pixel_y = span_m / tile_px
         self.x_min, self.y_max = tiles.column * span_m - HALF_M, HALF_M - tiles.row * span_m
         self.has_mask = True
+        self.statements = (
+            InputStatement(
+                name=reader.path.name, kind="imagery", unit="metre", datum=MERCATOR.name, accuracy_m=0.0,
+                assumed=reader.notes,
+            ),
+        )  # fmt: skip
         self._decoded: OrderedDict[Tile, np.ndarray | None] = OrderedDict()
 
     def __enter__(self) -> "TileImagery":

@@ -1,0 +1,207 @@
+"""A camera whose images contradict inertial readings: frozen with jitter, turned or mirrored after a restart."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from inertial_flight import ORIGIN, InertialFlight
+from overloaded_flight import FRAME_EVERY, FRAME_S, sigma_m
+from overloaded_flight import Flown as LoadedFlown
+from simulated_flight import PLACE, EstimatorRun
+from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
+from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
+from terrafix.messages import (
+    CalibrationFault,
+    MapMatch,
+    MeasurementVerdict,
+    Message,
+    NavEstimate,
+    Odometry,
+    Prediction,
+    Verdict,
+)
+
+SECONDS, FIRST, END = 25, 50, 100  # frames of the fault: 10 to 20 s
+KEYFRAME_EVERY = 5
+JITTER = 0.4 / 560.0  # 0.4 px
+Change = Callable[[Odometry, np.random.Generator], Odometry]
+
+
+@dataclass
+class Flown(LoadedFlown):
+    """``published``: by the estimator. ``velocity_off_mps``: error of the velocity of each of ``estimates``."""
+
+    published: list[Message] = field(default_factory=list)
+    velocity_off_mps: list[float] = field(default_factory=list)
+
+    def lies(self) -> list[str]:
+        """Fixes whose position or velocity is off by more than three times the claim, and by over 20 m or 3 m/s."""
+        found = []
+        for (estimate, error_m), off_mps in zip(self.estimates, self.velocity_off_mps, strict=True):
+            claim_mps, off_m = estimate.velocity_sigma_mps, float(np.hypot(*error_m))
+            wrong = off_m > max(20.0, 3.0 * sigma_m(estimate)) or off_mps > max(3.0, 3.0 * claim_mps)
+            if wrong and claim_mps < MAX_SENT_VELOCITY_SIGMA_MPS:
+                at = f"frame {estimate.frame_id}: {off_m:.0f} m at {sigma_m(estimate):.1f}"
+                found.append(f"{at}, {off_mps:.1f} m/s at {claim_mps:.2f}")
+        return found
+
+    def odometry(self) -> dict[int, Verdict]:
+        return {v.frame_id: v.verdict for v in self.verdicts if v.measurement == "odometry"}
+
+    def is_back(self, within_s: float) -> bool:
+        """Whether a true position is claimed so long after the end of the fault."""
+        end_s = END * FRAME_S
+        return any(
+            np.hypot(*error_m) < 20.0 and estimate.t_ns * 1e-9 <= end_s + within_s
+            for estimate, error_m in self.claimed(end_s)
+        )
+
+
+@cache
+def simulated(seed: int) -> InertialFlight:
+    return InertialFlight(seed, SECONDS, FRAME_EVERY)
+
+
+def flown(
+    seed: int,
+    change: Change,
+    matches: Callable[[int], int | None],
+    frames: int = END + 16,
+    first: Change | None = None,
+) -> Flown:
+    """``change``: of the odometry of a frame of the fault, whose keyframe is one of them, too. ``first``: of the first
+    one, whose keyframe is before the fault; None: it begins a fragment. ``matches``: the frame whose place the map
+    match of a frame of the fault has; None: it has none."""
+    flight, run = simulated(seed), EstimatorRun()
+    rng, result = np.random.default_rng([seed, 56]), Flown()
+    run.feed([ORIGIN])
+    for i in range(frames):
+        telemetry = [m for m in flight.messages_by_frame[i] if not isinstance(m, Odometry | MapMatch)]
+        odometry, *found = images(
+            flight, i, rng, first if i == FIRST and first else change, matches, tied=first is not None
+        )
+        replies = run.feed([*telemetry, odometry])
+        if any(isinstance(reply, Prediction) for reply in replies):  # the anchor matches those frames only
+            replies += run.feed(found)
+        for reply in replies:
+            if isinstance(reply, NavEstimate):
+                at_m = np.array(PLACE.to_local(reply.lat_deg, reply.lon_deg))
+                result.estimates.append((reply, at_m - flight.poses[reply.frame_id][1][:2]))
+                off_mps = np.array(reply.velocity_enu_mps) - flight.velocity_mps[reply.frame_id]
+                result.velocity_off_mps.append(float(np.linalg.norm(off_mps)))
+            elif isinstance(reply, MeasurementVerdict):
+                result.verdicts.append(reply)
+    result.published = run.published
+    return result
+
+
+def images(
+    flight: InertialFlight,
+    i: int,
+    rng: np.random.Generator,
+    change: Change,
+    matches: Callable[[int], int | None],
+    *,
+    tied: bool,
+) -> list[Message]:
+    """Odometry and map match of frame ``i``. ``tied``: the first frame of the fault is tied to the keyframe before."""
+    t_ns, faulty = round(i * FRAME_S * 1e9), FIRST <= i < END
+    keyframe, fragment = max((i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY, 0), (i >= FIRST and not tied) + (i >= END)
+    if i in (0, END) or (i == FIRST and not tied):
+        odometry = Odometry(
+            t_ns=t_ns, frame_id=i, keyframe_id=i, verdict=Verdict.ACCEPTED, becomes_keyframe=True, fragment_id=fragment
+        )
+    else:
+        odometry = flight.registered(i, keyframe, t_ns, rng, becomes_keyframe=i % KEYFRAME_EVERY == 0)
+        odometry = msgspec.structs.replace(odometry, fragment_id=fragment)
+        odometry = change(odometry, rng) if faulty else odometry
+    at = (matches(i) if faulty else i) if i and i % KEYFRAME_EVERY == 0 else None
+    return [odometry] if at is None else [odometry, msgspec.structs.replace(flight.fix(at, t_ns, rng), frame_id=i)]
+
+
+def with_pairs(odometry: Odometry, pairs: np.ndarray) -> Odometry:
+    return msgspec.structs.replace(odometry, two_view=[tuple(row) for row in pairs.reshape(-1, 4).tolist()])
+
+
+def frozen_with_jitter(odometry: Odometry, rng: np.random.Generator) -> Odometry:
+    """Every image shows the same view, displaced by 0.4 px."""
+    pairs = np.array(odometry.two_view)
+    pairs[:, 2:] = pairs[:, :2] + rng.normal(0.0, JITTER, 2) + rng.normal(0.0, 0.1 * JITTER, (len(pairs), 2))
+    return with_pairs(odometry, pairs)
+
+
+def seen_as(orientation: Orientation) -> Change:
+    inverse = np.linalg.inv(orientation.matrix)
+    return lambda odometry, _: with_pairs(odometry, np.array(odometry.two_view).reshape(-1, 2) @ inverse.T)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_frozen_picture_that_jitters_is_stalled_and_its_place_on_the_map_is_not_taken(seed: int) -> None:
+    result = flown(seed, frozen_with_jitter, lambda _: FIRST)
+    assert not result.lies()
+    verdicts = result.odometry()
+    assert [verdicts[i] for i in range(FIRST + 2, END)] == [Verdict.STALLED] * (END - FIRST - 2)
+    predicted = {m.frame_id for m in result.published if isinstance(m, Prediction)}
+    assert not predicted & set(range(FIRST + 2, END))
+    assert result.is_back(3.0)
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS, ids=lambda o: f"{o.quantity} {o.turned_deg}")
+def test_turned_or_mirrored_pictures_are_named_and_refused(orientation: Orientation) -> None:
+    result = flown(1, seen_as(orientation), lambda _: None)
+    assert not result.lies()
+    faults = [m for m in result.published if isinstance(m, CalibrationFault)]
+    assert [(m.quantity, m.active) for m in faults] == [(orientation.quantity, True), (orientation.quantity, False)]
+    assert faults[0].t_ns * 1e-9 - FIRST * FRAME_S < 3.0
+    assert faults[0].factor == (orientation.turned_deg if orientation.quantity == "picture turned" else None)
+    accepted = {frame for frame, verdict in result.odometry().items() if verdict is Verdict.ACCEPTED}
+    assert not accepted & set(range(FIRST, END))
+    predicted = {m.frame_id for m in result.published if isinstance(m, Prediction)}
+    assert not predicted & set(range(round(faults[0].t_ns * 1e-9 / FRAME_S), END))  # the anchor would lose the place
+    assert len([e for e, _ in result.claimed(FIRST * FRAME_S) if e.frame_id < END]) > 20  # by inertial readings
+    assert result.is_back(3.0)
+
+
+@pytest.mark.parametrize("turned_deg", [90, 180, -90])
+def test_a_picture_that_turns_from_one_frame_to_the_next_is_no_turn_of_the_vehicle(turned_deg: int) -> None:
+    """Features tie the first turned image to the keyframe before it."""
+    orientation = Orientation(turned_deg)
+    inverse = np.linalg.inv(orientation.matrix)
+
+    def turned_alone(odometry: Odometry, _: np.random.Generator) -> Odometry:
+        pairs = np.array(odometry.two_view)
+        return with_pairs(odometry, np.hstack([pairs[:, :2], pairs[:, 2:] @ inverse.T]))
+
+    result = flown(1, seen_as(orientation), lambda _: None, END, turned_alone)
+    verdicts = result.odometry()
+    assert verdicts[FIRST] is Verdict.IMPLAUSIBLE
+    assert Verdict.ACCEPTED not in {verdicts[i] for i in range(FIRST, END)}
+    assert not [v for v in result.verdicts if v.measurement in ("attitude", "heading")]
+    assert not result.lies()
+    faults = [m for m in result.published if isinstance(m, CalibrationFault)]
+    assert [(m.quantity, m.active) for m in faults] == [(orientation.quantity, True)]
+
+
+def four_times_as_fast(odometry: Odometry, _: np.random.Generator) -> Odometry:
+    """Every motion since the keyframe: images of another flight, which no orientation explains."""
+    pairs = np.array(odometry.two_view)
+    pairs[:, 2:] += 3.0 * (pairs[:, 2:] - pairs[:, :2]).mean(axis=0)
+    return with_pairs(odometry, pairs)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_images_that_contradict_inertial_readings_for_long_are_not_believed_for_that(seed: int) -> None:
+    """The graph is reset, as wide as all of that time allows, and only a place ties images to it again."""
+    result = flown(seed, four_times_as_fast, lambda _: None)
+    assert not result.lies()
+    resets = [v for v in result.resets() if v.detail == "odometry contradicts inertial readings for 5 s"]
+    assert len(resets) == 1
+    after = {e.frame_id: e for e, _ in result.estimates}
+    assert sigma_m(after[resets[0].frame_id]) > 5.0 * 15.0  # speeds of 15 m/s for five seconds
+    verdicts = result.odometry()
+    assert Verdict.ACCEPTED not in {verdicts[i] for i in range(FIRST, END)}
+    assert result.is_back(3.0)

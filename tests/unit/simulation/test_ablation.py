@@ -1,0 +1,39 @@
+"""The table of mechanisms that an ablation replaces, and the processes in which it does."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from terrafix_lab.ablation.__main__ import SHIM, main
+from terrafix_lab.ablation.mechanisms import MECHANISMS, VARIABLE
+
+PROBE = """
+from terrafix.estimator.integrity.map_consistency import MapConsistency
+import numpy as np
+found = MapConsistency()
+for _ in range(20):
+    found.add_rejected(np.array([300.0, 0.0]))
+print(found.probability > 0.5)
+"""
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_each_mechanism_can_be_replaced_in_a_process_of_its_own(name: str) -> None:
+    call = f"from terrafix_lab.ablation.mechanisms import MECHANISMS; MECHANISMS[{name!r}].replace()"
+    subprocess.run([sys.executable, "-c", call], check=True)
+
+
+@pytest.mark.parametrize(("ablated", "doubted"), [(False, "True"), (True, "False")])
+def test_a_child_process_has_the_replaced_mechanism(ablated: bool, doubted: str) -> None:
+    path = os.pathsep.join([str(SHIM), *filter(None, sys.path)])
+    environment = os.environ | ({VARIABLE: "map", "PYTHONPATH": path} if ablated else {})
+    program = [sys.executable, "-c", PROBE]
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == doubted
+
+
+@pytest.mark.parametrize("words", [[], ["out"], ["out", "--"], ["out", "nobody", "--", "montecarlo"]])
+def test_a_wrong_command_line_names_the_mechanisms(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2 and "lock" in capsys.readouterr().out
