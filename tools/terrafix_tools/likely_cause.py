@@ -10,6 +10,7 @@ from terrafix.messages import CalibrationFault, Verdict
 MIN_FRAMES = 8  # of a flight that is judged
 MAX_ANCHORED_SHARE = 0.05  # of the frames, of a flight that found nothing: false matches are rarer
 MATCHED_SHARE = 0.5  # of the frames that odometry has registered, for them to match each other
+UNMEASURED = "no monitor measured which"  # in a cause that a look at the map may settle (map_probe)
 # The scale first: a wrong one misplaces everything, and other monitors may follow it.
 _ORDER = ("scale", "mount yaw", "mirrored picture", "attitude", "heading")
 
@@ -41,7 +42,7 @@ def likely_cause(
         )
     return (
         f"{matched} of {frames} frames match each other, and none the map: focal length, height, mount, heading or map "
-        "is wrong, and no monitor measured which; `terrafix source info` says where each comes from"
+        f"is wrong, and {UNMEASURED}; `terrafix source info` says where each comes from"
     )
 
 

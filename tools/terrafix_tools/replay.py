@@ -30,7 +30,9 @@ from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import StoredModel, models_folder, resolve_model
 from terrafix_tools.flight_map import package_of
 from terrafix_tools.in_process import InProcessShell
+from terrafix_tools.likely_cause import UNMEASURED
 from terrafix_tools.live import swapped_hint
+from terrafix_tools.map_probe import likely_factor
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.rerun.frames import RecordedFrames
 from terrafix_tools.source.text import fact_lines
@@ -87,6 +89,9 @@ def replay(
         published: list[Message] = []
         shell = InProcessShell(nodes(ctx), lambda _who, message: published.append(message))
         _feed_flight(source, origin, shell, frames, published, output, watch, progress)
+        counts = output.counts()
+        if UNMEASURED in counts["verdict"]["cause"] and not isinstance(opened, RecordedFrames):
+            counts = output.counts(likely_factor(opened.shots(), origin, package))
         source.close()
         summary = {
             "flight": source.name(),
@@ -96,7 +101,7 @@ def replay(
             "models": {k: v for k, v in msgspec.to_builtins(config.models).items() if v and k not in NOT_MODELS},
             "config": msgspec.to_builtins(config),
             "versions": versions(),
-            **output.counts(),
+            **counts,
             "peak_memory_mb": peak_memory_mb(),
             "wall_s": round(time.perf_counter() - began_s, 2),
         }

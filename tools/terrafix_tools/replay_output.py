@@ -4,6 +4,7 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -109,9 +110,11 @@ class ReplayOutput:
         row = self._table.rows.get(frame_id)
         return round((row.t_s if row else 0.0) * NS)
 
-    def counts(self) -> dict[str, Any]:
-        """Returns frames, verdicts and times for summary.json."""
+    def counts(self, cause: str = "") -> dict[str, Any]:
+        """Returns frames, verdicts and times for summary.json. ``cause``: of a flight that found nothing, if something
+        else than its monitors has found it."""
         rows = list(self._table.rows.values())
+        verdict = flight_verdict(rows, self._faults, self._verdicts)
         times_ms = [r.process_ms for r in rows if r.process_ms is not None]
         return {
             "frames": len(rows),
@@ -120,7 +123,7 @@ class ReplayOutput:
             "odometry_frames": sum(self._registered.values()),
             "verdicts": {what: dict(sorted(c.items())) for what, c in sorted(self._verdicts.items())},
             "lens": lens_words(self._origin.camera, self._calibration) if self._origin and self._calibration else None,
-            "verdict": flight_verdict(rows, self._faults, self._verdicts).as_json(),
+            "verdict": (replace(verdict, cause=cause) if cause else verdict).as_json(),
             "matcher_verdicts": dict(sorted(self._matcher.items())),
             "matched_by": dict(sorted(self._matched_by.items())),
             "frame_ms_median": round(float(np.median(times_ms)), 1) if times_ms else None,

@@ -1,11 +1,15 @@
 """The likely cause of a flight that found nothing on the map, from the monitors and verdicts of its record."""
 
+import math
+from pathlib import Path
+
 import pytest
 
-from terrafix.messages import CalibrationFault
+from terrafix.messages import CalibrationFault, Camera, Origin
 from terrafix_tools.estimates import Row
 from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.likely_cause import likely_cause
+from terrafix_tools.map_probe import best_index, likely_factor
 
 LOST = {"map": {"few_inliers": 40}, "odometry": {"accepted": 38, "few_inliers": 2}}
 
@@ -65,3 +69,30 @@ def test_the_verdict_on_the_flight_ends_with_the_cause() -> None:
         "Likely cause: the height is 2.00 times the true one, or the focal length 0.50 times (it was measured)."
     )
     assert verdict.as_json()["cause"] == verdict.cause
+
+
+@pytest.mark.parametrize(
+    ("scores", "wraps", "best"),
+    [
+        ([[4.0, 4.1, 7.3, 4.0], [4.2, 4.0, 5.4, 3.9], [4.1, 4.0, 3.9, 4.0]], False, 2),
+        ([[4.0, 4.1, 7.3, 4.0], [4.2, 4.0, 3.9, 4.9]], False, 2),  # a step beside it agrees
+        ([[4.0, 4.1, 7.3, 4.0], [5.4, 4.0, 3.9, 4.0]], False, None),  # one frame alone
+        ([[4.0, 4.1, 5.9, 4.0], [4.0, 4.1, 5.9, 4.0]], False, None),  # as high as by chance
+        ([[7.0, 4.1, 4.0, 4.0], [4.0, 4.1, 4.0, 5.0]], True, 0),  # turns close to a circle
+        ([[7.0, 4.1, 4.0, 4.0], [4.0, 4.1, 4.0, 5.0]], False, None),
+        ([], False, None),
+    ],
+)
+def test_a_factor_needs_one_clear_frame_and_another_that_agrees(
+    scores: list[list[float]], wraps: bool, best: int | None
+) -> None:
+    assert best_index(scores, wraps=wraps) == best
+
+
+def test_without_a_start_the_map_is_not_asked() -> None:
+    camera = Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
+    unknown = Origin(
+        t_ns=0, camera=camera, lat_deg=48.0, lon_deg=11.0, ground_amsl_m=None, start_sigma_m=math.inf,
+        yaw_sigma_deg=5.0, agl_sigma_m=5.0, attitude_sigma_deg=2.0,
+    )  # fmt: skip
+    assert likely_factor(iter(()), unknown, Path("nowhere.gpkg")) == ""

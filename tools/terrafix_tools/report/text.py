@@ -1,7 +1,7 @@
 """Key figures of the report, and its list of events as text."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -89,7 +89,9 @@ def events(view: FlightView) -> list[tuple[float | None, str]]:
     entries: list[tuple[float | None, str]] = []
     entries += _positions(view) + _anchors(view) + _errors(view) + _gps(view)
     entries += [(t_s, f"{fault_text(fault).capitalize()}: {fault.detail}.") for t_s, fault in view.faults]
-    entries.append((None, f"Verdict: {flight_verdict(view.rows, view.faults, view.verdicts).text()}"))
+    verdict = flight_verdict(view.rows, view.faults, view.verdicts)
+    cause = view.summary.get("verdict", {}).get("cause", "") if verdict.cause else ""
+    entries.append((None, f"Verdict: {(replace(verdict, cause=cause) if cause else verdict).text()}"))
     lens = lens_words(view.origin.camera, view.calibration) if view.origin and view.calibration else None
     if lens is not None:
         entries.append((None, lens))

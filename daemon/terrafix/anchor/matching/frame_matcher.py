@@ -246,6 +246,11 @@ class FrameMatcher:
                 hypotheses = coarse.best_hypotheses(MAX_FINE_HYPOTHESES)
         return self._correlated(image, view, belief, hypotheses, cell)
 
+    def correlate_as(self, grey: Image, view: View, belief: SearchWindow, hypothesis: Hypothesis) -> CorrelationResult:
+        """``correlate`` of a grey image with one hypothesis of yaw and height, of any size."""
+        turned = view_at(view, hypothesis, view.e_m, view.n_m)
+        return self._correlated(grey, turned, belief, (AS_PREDICTED,), self.correlation_cell_m(turned.agl_m))
+
     def _correlated(
         self, image: Image, view: View, belief: SearchWindow, hypotheses: tuple[Hypothesis, ...], cell: float
     ) -> CorrelationResult:
