@@ -12,7 +12,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "licences.md"
-NOT_SHIPPED = ("dev", "nightly")  # extras that only the checks use
+NOT_SHIPPED = ("dev", "docs", "nightly")  # extras of the checks and of the documentation
 ALLOWED = {
     "0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "ISC", "MIT", "MIT-0", "MIT-CMU",
     "PSF-2.0", "Python-2.0", "Unlicense", "Zlib",
@@ -94,19 +94,36 @@ def is_allowed(expression: str) -> bool:
     return any(all(part.strip() in ALLOWED for part in re.split(r"\bAND\b", one)) for one in alternatives)
 
 
-def rows() -> dict[str, str]:
-    """Row of the page by package."""
+def packages() -> dict[str, tuple[str, str]]:
+    """What brings it, and its licence, by package."""
     extras: dict[str, list[str]] = {}
     for extra, requirements in project().items():
         for name in closure(requirements):
             extras.setdefault(name, []).append(extra)
+    return {
+        name: ("every installation" if "" in where else ", ".join(sorted(where)), licence_of(name) or "unknown")
+        for name, where in sorted(extras.items())
+    }
+
+
+def rows() -> list[str]:
+    """The table of the page: packages by what brings them and by licence."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for name, kind in packages().items():
+        found.setdefault(kind, []).append(name)
+    order = sorted(found, key=lambda kind: (kind[0] != "every installation", kind))
+    return [f"| {where} | {licence} | {', '.join(found[where, licence])} |" for where, licence in order]
+
+
+def written() -> dict[str, tuple[str, str]]:
+    """The packages that the page states, as ``packages``."""
     found = {}
-    for name, where in sorted(extras.items()):
-        comes_with = "every installation" if "" in where else ", ".join(sorted(where))
-        found[name] = f"| {name} | {licence_of(name) or 'unknown'} | {comes_with} |"
+    for row in PAGE.read_text(encoding="utf-8").partition(TABLE)[2].splitlines():
+        where, licence, names = (cell.strip() for cell in row.strip("|").split("|"))
+        found.update(dict.fromkeys(names.split(", "), (where, licence)))
     return found
 
 
 if __name__ == "__main__":
     above, rule, _ = PAGE.read_text(encoding="utf-8").partition(TABLE)
-    PAGE.write_text(above + rule + "\n".join(rows().values()) + "\n", encoding="utf-8")
+    PAGE.write_text(above + rule + "\n".join(rows()) + "\n", encoding="utf-8")

@@ -1,20 +1,12 @@
-"""Generates the two tables of docs/architecture.md from the code. Run this file to write them into the page."""
+"""Generates the table of docs/architecture.md from the code. Run this file to write it into the page."""
 
 import re
 from pathlib import Path
 
-import msgspec
-
 from terrafix import messages
-from terrafix.processes import ALL_MESSAGES, PROCESSES, SUPERVISOR
+from terrafix.processes import ALL_MESSAGES, PROCESSES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "architecture.md"
-# Published by the shell and the supervisor, which are not processes of the table.
-OTHER_PUBLISHERS = {
-    "ProcessEvent": f"the {SUPERVISOR}",
-    "Dropped": "the shell of every process",
-    "LogLine": f"the shell of every process, the {SUPERVISOR}",
-}
 
 
 def process_table() -> str:
@@ -30,35 +22,20 @@ def process_table() -> str:
     return "\n".join(rows)
 
 
-def message_table() -> str:
-    rows = ["| message | published by | subscribed by | contents |", "|---|---|---|---|"]
-    for message in ALL_MESSAGES:
-        publishers = [p.name for p in PROCESSES if message in p.publishes]
-        publishers += [OTHER_PUBLISHERS[message.__name__]] if message.__name__ in OTHER_PUBLISHERS else []
-        subscribers = [p.name for p in PROCESSES if message in p.subscribes and p.subscribes != ALL_MESSAGES]
-        columns = message.__name__, ", ".join(publishers), ", ".join(subscribers) or "-", _purpose(message)
-        rows.append(f"| {' | '.join(columns)} |")
-    return "\n".join(rows)
-
-
 def page(text: str) -> str:
-    """The text of the page with both tables generated from the code."""
-    for name, table in (("processes", process_table()), ("messages", message_table())):
-        text, count = re.subn(
-            rf"(<!-- table: {name} -->).*?(<!-- end -->)", lambda m, t=table: f"{m[1]}\n{t}\n{m[2]}", text, flags=re.S
-        )
-        assert count == 1, f"{PAGE}: the marks of the table '{name}' are missing"
+    """The text of the page with the table generated from the code."""
+    text, count = re.subn(
+        r"(<!-- table: processes -->).*?(<!-- end -->)",
+        lambda m: f"{m[1]}\n{process_table()}\n{m[2]}",
+        text,
+        flags=re.S,
+    )
+    assert count == 1, f"{PAGE}: the marks of the table are missing"
     return text
 
 
 def _names(of: tuple[type[messages.Message], ...]) -> str:
     return ", ".join(message.__name__ for message in of) or "-"
-
-
-def _purpose(message: type[msgspec.Struct]) -> str:
-    """-> first paragraph of the docstring, without requirement ids."""
-    first = " ".join((message.__doc__ or "").strip().split("\n\n")[0].split())
-    return re.sub(r" \([A-Z]{2}-\d+[^)]*\)", "", first).replace("``", "`")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # Modules that are not on a vehicle, by the extra that brings them: how their names begin.
 EXTRAS = {
     "console": (
-        "fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "python_multipart", "pydantic",
+        "fastapi", "starlette", "uvicorn", "sqlalchemy", "python_multipart", "pydantic",
         "terrafix_tools.console",
     ),
     "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "terrafix_"),

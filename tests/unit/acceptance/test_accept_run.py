@@ -18,9 +18,10 @@ from terrafix_lab.accept.false_inputs.scenarios import LIES
 from terrafix_lab.accept.fly import Job, Point, Result
 from terrafix_lab.accept.measuring.criteria import EVERYWHERE, unmeasured
 from terrafix_lab.accept.measuring.results import JudgedRow, Marks, Verdict
+from terrafix_lab.accept.page import write
 from terrafix_lab.accept.run import AcceptOptions, accept, truth_of
 from terrafix_lab.accept.scenarios import BY_NAME, SCENARIOS
-from terrafix_lab.accept.table import conclude, headline, markdown, write
+from terrafix_lab.accept.table import conclude, headline, markdown
 from terrafix_lab.faults.edits import Span
 
 

@@ -23,7 +23,7 @@ from terrafix.messages import (
 from terrafix.recorder.provenance import header
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.estimates import Row, write_rows
-from terrafix_tools.report.charts import clock, spans_of, ticks
+from terrafix_tools.pages.charts import clock, spans_of, ticks
 from terrafix_tools.report.page import report
 
 

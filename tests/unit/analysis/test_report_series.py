@@ -8,12 +8,12 @@ import pytest
 
 from flight_records import estimate, frame, gps_input
 from terrafix import messages as m
-from terrafix_tools.report.charts import Chart
+from terrafix_tools.pages.charts import Chart
+from terrafix_tools.pages.series import COLUMNS, thin_line, thin_marks, thin_path, thin_spans
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.innovations import Innovations, spread_of
 from terrafix_tools.report.sections_computer import computer, medians
 from terrafix_tools.report.sections_innovations import innovations
-from terrafix_tools.report.series import COLUMNS, thin_line, thin_marks, thin_path, thin_spans
 from terrafix_tools.report.stage_times import StageTimes
 
 MS = 1_000_000

@@ -120,8 +120,24 @@ def test_the_table_of_a_page_is_replaced_and_names_broken_promises(tmp_path: Pat
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     assert "| fault | cruise | turn |\n|---|---|---|\n" in text
-    assert "| none | 0.1 s, 0.0 s | 4.0 s, 9.0 s **2 wrong positions** |" in text
+    assert "| none | | 4.0/9.0 **2 wrong positions** |" in text
     assert table([good, bad]).endswith("\n\n2 cells with 100 positions, 2 of them wrong.")
+
+
+def test_faults_without_an_effect_are_named_below_the_table() -> None:
+    def outcome(fault: str, silence_s: float, back_s: float | None, phase: Phase = Phase.CRUISE) -> Outcome:
+        return Outcome(fault=fault, phase=phase, verdict="ok", silence_s=silence_s, back_s=back_s)
+
+    quiet = [outcome("link: slow", 0.24, 0.0), outcome("link: leak", 0.1, 0.0), outcome("disk: full", 0.1, 0.0)]
+    text = table(
+        [*quiet, outcome("link: silent", 6.0, 0.0), outcome("none", 0.1, 0.1), outcome("disk: slow", 0.1, None)]
+    )
+    assert [row for row in text.splitlines() if row.startswith("| ")] == [
+        "| fault | cruise |", "| none | 0.1/0.1 |", "| link: silent | 6.0/0.0 |", "| disk: slow | 0.1/- |",
+    ]  # fmt: skip
+    assert "\n\nWithout effect: link: slow, leak; disk: full.\nNot flown: " in text
+    dark = table([outcome("none", 0.1, 1.5, Phase.DARK), outcome("disk: full", 0.1, 1.6, Phase.DARK)])
+    assert "| disk: full | 0.1/1.6 |" in dark and "Without effect: none." in dark
 
 
 def test_the_sum_of_a_table_has_the_worst_error_and_the_load_of_the_computer() -> None:
@@ -135,7 +151,8 @@ def test_the_sum_of_a_table_has_the_worst_error_and_the_load_of_the_computer() -
 
 def test_a_cell_whose_flight_failed_before_the_fault_is_none_of_the_table_and_is_flown_again(tmp_path: Path) -> None:
     failed = Outcome(fault="none", phase=Phase.CRUISE, verdict=verdict.NO_FIX, silence_s=0.1, fixes=3)
-    assert "| none | - |\n" in table([failed]) and "0 cells with 0 positions" in table([failed])
+    assert "| none |" not in table([failed]) and "Not flown: none; " in table([failed])
+    assert "0 cells with 0 positions" in table([failed])
     results = Results(tmp_path / "results.json")
     results.add(failed)
     assert not results.has(MATRIX[0], Phase.CRUISE)

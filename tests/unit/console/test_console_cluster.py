@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from terrafix_tools.cli import app
-from terrafix_tools.parallel.pool import check_scheduler
+from terrafix_tools.parallel.scheduler import check_scheduler
 
 
 def test_a_service_whose_scheduler_does_not_answer_does_not_start(tmp_path: Path) -> None:

@@ -1,19 +1,22 @@
 """Events of a flight: stored in order, sent once, over reconnections and restarts."""
 
 import asyncio
+import sqlite3
 from collections.abc import AsyncIterator, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from console_rig import NEW, Console, settings
+from terrafix.core.errors import OutputError
 from terrafix_tools.console import feed as feed_module
 from terrafix_tools.console.compute.observed import FrameOutcome
 from terrafix_tools.console.events import EVENTS, Health, ProcessingBlocked, VerdictGiven, name_of
 from terrafix_tools.console.feed import Feed
 from terrafix_tools.console.payloads import FlightState, Fragment, FrameResult, Hint, InputRequest, NewFlight
-from terrafix_tools.console.store import flights, schema
-from terrafix_tools.console.store.database import Database, open_database
+from terrafix_tools.console.store import flights
+from terrafix_tools.console.store.database import FILE, Database, open_database
 from terrafix_tools.console.store.flights import StoredEvent
 
 
@@ -54,15 +57,29 @@ def test_names_of_events_are_those_of_the_contract() -> None:
     ]
 
 
-def test_the_migrations_make_the_tables_of_the_schema(database: Database) -> None:
-    import sqlalchemy as sa
+def test_a_file_of_the_time_before_versions_keeps_its_flights(database: Database, tmp_path: Path) -> None:
+    flight_id = new_flight(database)
+    database.close()
+    with closing(sqlite3.connect(tmp_path / FILE)) as former:  # as Alembic left it
+        former.executescript("PRAGMA user_version = 0; CREATE TABLE alembic_version (version_num VARCHAR(32));")
+    for _ in range(2):
+        opened = open_database(tmp_path)
+        with opened.read() as db:
+            assert [flight.flight_id for flight in flights.all_flights(db)] == [flight_id]
+        opened.close()
 
-    with database.read() as db:
-        made = sa.inspect(db)
-        for table in schema.metadata.sorted_tables:
-            assert {c["name"] for c in made.get_columns(table.name)} == set(table.columns.keys())
-            keys = made.get_pk_constraint(table.name)["constrained_columns"]
-            assert keys == [c.name for c in table.primary_key]
+
+def test_a_file_with_tables_of_a_later_version_is_refused(database: Database, tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / FILE)) as later:
+        later.execute("PRAGMA user_version = 7")
+    with pytest.raises(OutputError, match=r"console.sqlite: has tables of version 7, .*; update Terrafix, or name"):
+        open_database(tmp_path)
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_text("no database " * 100)
+    with pytest.raises(OutputError, match=r"console.sqlite: cannot be opened .*; name another folder with --data"):
+        open_database(tmp_path)
 
 
 def test_a_step_that_is_computed_again_adds_nothing(database: Database) -> None:

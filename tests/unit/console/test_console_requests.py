@@ -156,6 +156,14 @@ def test_a_body_that_is_no_multipart_or_is_cut_is_refused(console: Console) -> N
     assert_refused(console.send("POST", path, b"", kind), 422)
 
 
+@pytest.mark.parametrize("head", [b"X: " + b"a" * 5000 + b"\r\n", b"X: a\r\n" * 9, b"X" * 100_000])
+def test_a_part_with_too_many_or_too_long_headers_is_refused(console: Console, head: bytes) -> None:
+    path = f"/flights/{console.create()}/images/batch"
+    kind = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
+    body = b"--" + BOUNDARY.encode() + b"\r\n" + head
+    assert_refused(console.send("POST", path, body, kind), 422, "eader")
+
+
 def test_names_and_tokens_beyond_latin_1_are_no_failure_of_the_service(console: Console) -> None:
     kind = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
     path = f"/flights/{console.create()}/images/batch"

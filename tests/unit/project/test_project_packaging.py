@@ -25,7 +25,7 @@ EXTRAS = {  # libraries, without our own distribution for the ground
     extra: {canonicalize_name(Requirement(r).name): Requirement(r) for r in requirements if GROUND["name"] not in r}
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
-WITHOUT_GROUND = {"vehicle", "faiss", "dev", "nightly"}  # what a vehicle may have, and the checks
+WITHOUT_GROUND = {"vehicle", "faiss", "dev", "docs", "nightly"}  # what a vehicle may have, and the checks
 IMPORTED_AS = {
     "foxglove-schemas-protobuf": "foxglove_schemas_protobuf",
     "protobuf": "google",

@@ -62,7 +62,7 @@ def test_ci_runs_only_the_check_command() -> None:
     assert lines(ci) == ["set -eu", 'cd "$(dirname "$0")/.."', CHECK]
 
 
-@pytest.mark.parametrize("script", ["demo", "check", "install", "lock", "nightly", "pythons"])
+@pytest.mark.parametrize("script", ["demo", "check", "install", "lock", "nightly", "pythons", "site"])
 def test_scripts_have_no_shell_syntax_errors(script: str) -> None:
     done = subprocess.run(["sh", "-n", f"scripts/{script}"], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

@@ -1,21 +1,24 @@
 """acceptance.html: one self-contained page. Failed rows come first."""
 
-from html import escape
-from importlib.resources import files
-from typing import TYPE_CHECKING
+import json
+from pathlib import Path
+
+import msgspec
 
 from terrafix_lab.accept.fly import Result
 from terrafix_lab.accept.measuring.results import BROKEN, JudgedRow, Verdict, with_unit
-from terrafix_tools.report.charts import Chart, spans_of
+from terrafix_lab.accept.table import NAME, Acceptance, markdown
+from terrafix_tools.pages.charts import Chart, spans_of
+from terrafix_tools.pages.document import Figure, kit, macros, write_file
 
-if TYPE_CHECKING:
-    from terrafix_lab.accept.table import Acceptance
-
+OWN = macros("terrafix_lab/acceptance.html")
 ERROR_FLOOR_M = 0.5  # of the logarithmic axis
 ERROR_TOP_M = 2000.0  # the same for all charts, to compare them
 WIDTH, HEIGHT = 400, 190  # of one chart, in its own units
 STRIP = 6  # height of the source labels under the chart
 WORDS = {"satellite_anchored": "map match", "visual_propagated": "odometry", "dead_reckoned": "dead reckoning"}
+KEYS = [("k-ink", "error"), ("k-claim", "claimed 95 % radius"), ("k-sat", "map match"), ("k-vis", "odometry")]
+KEYS += [("k-dead", "dead reckoning"), ("k-none", "no position")]
 MARKS = {
     Verdict.PASS: ("good", "holds"),
     Verdict.BELOW: ("bad", "below floor"),
@@ -24,28 +27,31 @@ MARKS = {
 }
 
 
-def page(acceptance: "Acceptance") -> str:
+def write(acceptance: Acceptance, out: Path) -> None:
+    """acceptance.json, acceptance.md, acceptance.html. Raises OutputError."""
+    text = {
+        "json": json.dumps(msgspec.to_builtins(acceptance), indent=1, allow_nan=False) + "\n",
+        "md": markdown(acceptance),
+        "html": page(acceptance),
+    }
+    for suffix, content in text.items():
+        write_file(out / f"{NAME}.{suffix}", content, "; choose another --out")
+
+
+def page(acceptance: Acceptance) -> str:
     """The whole document."""
-    sheets = (files("terrafix_tools") / "assets" / "report.css", files("terrafix_lab") / "assets" / "acceptance.css")
-    style = "".join(sheet.read_text(encoding="utf-8") for sheet in sheets)
-    flown = [result for result in acceptance.results if result.points]
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>Acceptance: {escape(acceptance.flight)}</title><style>{style}</style></head><body><main>"
-        f"{_head(acceptance)}{_broken(acceptance)}{_matrix(acceptance)}{_pictures(flown)}{_rows(acceptance)}"
-        "</main></body></html>\n"
-    )
+    parts = (_head(acceptance), _broken(acceptance), _matrix(acceptance), _pictures(acceptance), _rows(acceptance))
+    return kit.document(f"Acceptance: {acceptance.flight}", "", *parts)
 
 
-def _head(acceptance: "Acceptance") -> str:
+def _head(acceptance: Acceptance) -> str:
     counts = {verdict: sum(row.verdict is verdict for row in acceptance.rows) for verdict in Verdict}
-    figures = [
-        (str(sum(bool(r.points) for r in acceptance.results)), "scenarios flown", ""),
-        (str(counts[Verdict.PASS]), "rows hold their floor", "good"),
-        (str(counts[Verdict.BELOW]), "rows below their floor", "bad" if counts[Verdict.BELOW] else ""),
-        (str(counts[Verdict.NOT_BUILT]), "rows not built", "bad" if counts[Verdict.NOT_BUILT] else ""),
-        (str(counts[Verdict.NOT_MEASURABLE]), "rows not measurable here", ""),
+    shown = [
+        Figure(str(sum(bool(r.points) for r in acceptance.results)), "", "scenarios flown"),
+        Figure(str(counts[Verdict.PASS]), "", "rows hold their floor", "good"),
+        Figure(str(counts[Verdict.BELOW]), "", "rows below their floor", "bad" if counts[Verdict.BELOW] else ""),
+        Figure(str(counts[Verdict.NOT_BUILT]), "", "rows not built", "bad" if counts[Verdict.NOT_BUILT] else ""),
+        Figure(str(counts[Verdict.NOT_MEASURABLE]), "", "rows not measurable here"),
     ]
     machine = acceptance.machine
     facts = [
@@ -55,84 +61,67 @@ def _head(acceptance: "Acceptance") -> str:
         f"{machine['cpu']}, {machine['cores']} cores",
         f"terrafix {machine['versions'].get('terrafix', '')}",
     ]
-    cells = "".join(f'<div><b class="{css}">{value}</b><span>{text}</span></div>' for value, text, css in figures)
-    return (
-        f"<header><h1>Acceptance</h1><p>{escape(acceptance.flight)}</p>"
-        f"<p>{escape(' · '.join(fact for fact in facts if fact))}</p></header>"
-        f'<div class="figures wide">{cells}</div>'
-    )
+    line = " · ".join(fact for fact in facts if fact)
+    return kit.header("", "Acceptance", acceptance.flight, line) + kit.figures(shown)
 
 
-def _broken(acceptance: "Acceptance") -> str:
+def _broken(acceptance: Acceptance) -> str:
     rows = [row for row in acceptance.rows if row.verdict in BROKEN]
     if not rows:
-        return "<h2>Every floor that was measured holds</h2>"
-    items = "".join(
-        f"<li><b>{escape(name)}</b><div>"
-        + "".join(
-            f"<span>{row.ac}: {escape(row.what)} {_number(row)}{', floor ' + escape(row.floor) if row.floor else ''}"
-            f"{'; ' + escape(row.why) if row.why else ''}</span>"
-            for row in rows
-            if row.scenario == name
-        )
-        + "</div></li>"
+        return kit.section("Every floor that was measured holds", "")
+    scenarios = [
+        (name, [_broken_row(row) for row in rows if row.scenario == name])
         for name in dict.fromkeys(row.scenario for row in rows)
-    )
-    return f'<h2>What does not pass</h2><ul class="broken">{items}</ul>'
+    ]
+    return kit.section("What does not pass", "", OWN.broken(scenarios))
 
 
-def _number(row: JudgedRow) -> str:
-    return (
-        f'<b class="bad">{escape(with_unit(row.measured, row.unit) if row.measured is not None else row.verdict)}</b>'
-    )
+def _broken_row(row: JudgedRow) -> tuple[str, str, str, str]:
+    measured = with_unit(row.measured, row.unit) if row.measured is not None else str(row.verdict)
+    more = (f", floor {row.floor}" if row.floor else "") + (f"; {row.why}" if row.why else "")
+    return row.ac, row.what, measured, more
 
 
-def _matrix(acceptance: "Acceptance") -> str:
+def _matrix(acceptance: Acceptance) -> str:
     """Scenarios down, requirements across; a cell shows its worst row."""
     columns = sorted({row.ac for row in acceptance.rows}, key=lambda ac: (ac[:2], int(ac.split("-")[1])))
-    names = list(dict.fromkeys(row.scenario for row in acceptance.rows))
-    head = "".join(f"<th>{ac}</th>" for ac in columns)
-    body = ""
-    for name in names:
-        cells = "".join(
-            _cell([row for row in acceptance.rows if row.scenario == name and row.ac == ac]) for ac in columns
-        )
-        body += f"<tr><th>{escape(name)}</th>{cells}</tr>"
-    return (
-        '<h2>Scenarios and requirements</h2><p class="lead">Green holds its floor, red does not, grey could not be '
-        "measured here. A cell shows the worst of its rows; point at it for all of them.</p>"
-        f'<div class="scroll"><table class="matrix"><tr><th></th>{head}</tr>{body}</table></div>'
+    rows = [
+        (name, [_cell([row for row in acceptance.rows if (row.scenario, row.ac) == (name, ac)]) for ac in columns])
+        for name in dict.fromkeys(row.scenario for row in acceptance.rows)
+    ]
+    return kit.section(
+        "Scenarios and requirements",
+        "Green holds its floor, red does not, grey could not be measured here. A cell shows the worst of its rows; "
+        "point at it for all of them.",
+        OWN.matrix(columns, rows),
     )
 
 
-def _cell(rows: list[JudgedRow]) -> str:
+def _cell(rows: list[JudgedRow]) -> tuple[str, str, str] | None:
+    """CSS class, tip, text."""
     if not rows:
-        return "<td></td>"
+        return None
     order = (Verdict.BELOW, Verdict.NOT_BUILT, Verdict.PASS, Verdict.NOT_MEASURABLE)
     worst = min(rows, key=lambda row: order.index(row.verdict))
     tip = "\n".join(
         f"{r.what}: {with_unit(r.measured, r.unit)}, {r.verdict}{'; ' + r.why if r.why else ''}" for r in rows
     )
-    text = with_unit(worst.measured, worst.unit) if worst.measured is not None else MARKS[worst.verdict][1]
-    css = MARKS[worst.verdict][0]
-    return f'<td class="m-{css}" title="{escape(tip)}">{escape(text)}</td>'
+    css, word = MARKS[worst.verdict]
+    return css, tip, with_unit(worst.measured, worst.unit) if worst.measured is not None else word
 
 
-def _pictures(results: list[Result]) -> str:
-    figures = "".join(_picture(result) for result in results)
-    return (
-        "<h2>Error and claim, scenario by scenario</h2>"
-        '<p class="lead">The line is the error, the shaded area the claimed 95 % radius: a consistent covariance '
-        "covers the line. Grey: a fault. Below each picture, where the position came from.</p>"
-        f'<div class="multiples">{figures}</div><div class="legend">'
-        '<span><i class="key k-ink"></i> error</span><span><i class="key k-claim"></i> claimed 95 % radius</span>'
-        '<span><i class="key k-sat"></i> map match</span><span><i class="key k-vis"></i> odometry</span>'
-        '<span><i class="key k-dead"></i> dead reckoning</span><span><i class="key k-none"></i> no position</span>'
-        "</div>"
+def _pictures(acceptance: Acceptance) -> str:
+    return kit.section(
+        "Error and claim, scenario by scenario",
+        "The line is the error, the shaded area the claimed 95 % radius: a consistent covariance covers the line. "
+        "Grey: a fault. Below each picture, where the position came from.",
+        OWN.pictures([_picture(result) for result in acceptance.results if result.points]),
+        kit.legend(KEYS),
     )
 
 
-def _picture(result: Result) -> str:
+def _picture(result: Result) -> tuple[str, str, str, str, str]:
+    """Name, css class and words of its verdict, promise, SVG."""
     zero_s, end_s = result.points[0].t_s, result.points[-1].t_s
     chart = Chart(
         x_max=max(end_s - zero_s, 1.0), y_min=ERROR_FLOOR_M, y_max=ERROR_TOP_M, width=WIDTH, height=HEIGHT, log_y=True,
@@ -150,22 +139,14 @@ def _picture(result: Result) -> str:
         chart.bottom_strip(low, high, f"f-{label or 'none'}", WORDS.get(label, "no position"), STRIP)
     broken = sum(row.verdict in BROKEN for row in result.rows)
     css, words = ("bad", f"{broken} below floor or not built") if broken else ("good", "holds")
-    return (
-        f'<figure class="multiple"><figcaption><b>{escape(result.scenario)}</b> <span class="{css}">{words}</span>'
-        f"<br>{escape(result.promise)}</figcaption>{chart.svg(f'Error and claim: {result.scenario}')}</figure>"
-    )
+    return result.scenario, css, words, result.promise, chart.svg(f"Error and claim: {result.scenario}")
 
 
-def _rows(acceptance: "Acceptance") -> str:
-    body = "".join(
-        f"<tr><td>{escape(row.scenario)}</td><td>{row.ac}</td><td>{escape(row.what)}</td>"
-        f"<td>{escape(with_unit(row.measured, row.unit))}</td><td>{escape(row.floor)}</td><td>{escape(row.goal)}</td>"
-        f'<td class="{MARKS[row.verdict][0]}">{row.verdict}{", goal met" if row.goal_met else ""}</td>'
-        f"<td>{escape(row.why)}</td></tr>"
-        for row in acceptance.rows
-    )
-    head = "".join(f"<th>{t}</th>" for t in ("scenario", "row", "what", "measured", "floor", "goal", "verdict", ""))
-    return (
-        f'<details><summary>All {len(acceptance.rows)} rows</summary><div class="scroll">'
-        f'<table class="rows"><tr>{head}</tr>{body}</table></div></details>'
-    )
+def _rows(acceptance: Acceptance) -> str:
+    columns = ("scenario", "row", "what", "measured", "floor", "goal", "verdict", "")
+    rows = []
+    for row in acceptance.rows:
+        verdict = OWN.verdict(MARKS[row.verdict][0], f"{row.verdict}{', goal met' if row.goal_met else ''}")
+        measured = with_unit(row.measured, row.unit)
+        rows.append([row.scenario, row.ac, row.what, measured, row.floor, row.goal, verdict, row.why])
+    return kit.folded(f"All {len(rows)} rows", kit.table(columns, rows, css="rows"))

@@ -19,9 +19,10 @@ from terrafix_lab.accept.false_inputs.scenarios import LIES, LIES_IN_THE_LOOP
 from terrafix_lab.accept.fly import RESULT, Job, Result
 from terrafix_lab.accept.measuring.criteria import failed, unmeasured
 from terrafix_lab.accept.measuring.results import BROKEN, with_unit
+from terrafix_lab.accept.page import write
 from terrafix_lab.accept.plan import CLOSED_LOOP, Scenario
 from terrafix_lab.accept.scenarios import BY_NAME, COMMAND, SCENARIOS
-from terrafix_lab.accept.table import Acceptance, conclude, write
+from terrafix_lab.accept.table import Acceptance, conclude
 from terrafix_lab.faults.fault import check_flown_by
 from terrafix_lab.faults.table import FAULTS
 

@@ -1,18 +1,14 @@
-"""The whole table: rows of all scenarios and rows over all of them; acceptance.json and acceptance.md."""
+"""The whole table: rows of all scenarios and rows over all of them; acceptance.md."""
 
-import json
 import statistics
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from terrafix.core.errors import OutputError
 from terrafix.core.gate import CHI2_95
 from terrafix_lab.accept.fly import Result
 from terrafix_lab.accept.measuring.consistency import COVERAGE, RUN_CONFIDENCE, judge_claims
 from terrafix_lab.accept.measuring.results import BROKEN, Bounds, JudgedRow, Verdict, with_unit
-from terrafix_lab.accept.page import page
 from terrafix_tools.timing import machine
 
 NAME = "acceptance"
@@ -107,22 +103,6 @@ def _not_replayable() -> list[JudgedRow]:
             floor="<= 20 m", goal="", verdict=Verdict.NOT_MEASURABLE, goal_met=None,
             why="needs objects with known positions: python -m terrafix_lab.bench.locate"),
     ]  # fmt: skip
-
-
-def write(acceptance: Acceptance, out: Path) -> None:
-    """acceptance.json, acceptance.md, acceptance.html. Raises OutputError."""
-    text = {
-        "json": json.dumps(msgspec.to_builtins(acceptance), indent=1, allow_nan=False) + "\n",
-        "md": markdown(acceptance),
-        "html": page(acceptance),
-    }
-    for suffix, content in text.items():
-        target, part = out / f"{NAME}.{suffix}", out / f"{NAME}.{suffix}.partial"
-        try:
-            part.write_text(content, encoding="utf-8")
-            part.replace(target)
-        except OSError as error:
-            raise OutputError(f"{target}: cannot be written ({error.strerror}); choose another --out") from None
 
 
 def markdown(acceptance: Acceptance) -> str:

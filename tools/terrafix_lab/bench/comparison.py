@@ -41,7 +41,7 @@ def spread_text(times_ms: dict[str, float] | None) -> str:
     """Median, 95th and 99th percentile."""
     if not times_ms:
         return "-"
-    return " / ".join(f"{times_ms[key]:.{0 if times_ms['median'] >= 9.95 else 1}f}" for key in ("median", "p95", "p99"))
+    return "/".join(f"{times_ms[key]:.{0 if times_ms['median'] >= 9.95 else 1}f}" for key in ("median", "p95", "p99"))
 
 
 def percent_text(share: float | None) -> str:

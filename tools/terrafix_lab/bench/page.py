@@ -16,11 +16,10 @@ OURS, FLOOR, PEER, PALE = "#5b9bd9", "#1d5288", "#c9853c", "#ecd3b8"
 
 HEAD = """# Benchmark
 
-Written by `terrafix bench --page docs/benchmark.md` from one run. Its [JSON](outputs.md#benchjson) has the same figures
-and more. Do not edit.
+Written by `terrafix bench --page docs/benchmark.md` from one run. Its [JSON](outputs.md#benchjson) has more.
 
-{cpu}, {cores} cores, load {load} before and after: other programs may have used the computer, too, so compare processor
-times, and those of one run. All are of one frame in milliseconds, without the first frame: median / 95 % / 99 %.
+{cpu}, {cores} cores, load {load} before and after: compare processor times, and those of one run. All are of one
+frame in milliseconds, without the first frame: median/95 %/99 %.
 
 ![Processor time of each method and stage](images/{picture})
 
@@ -28,14 +27,12 @@ times, and those of one run. All are of one frame in milliseconds, without the f
 
 The same frames and predictions. A peer matches points of the orthorectified frame with those of the map up to 70 m
 around it and fits a homography by RANSAC. It begins at the position that our estimator predicts, and has no odometry,
-filter and no covariance of its own. *Points kept*: without the time for the points of the map, which a system could
-keep."""
+filter or covariance of its own. *Points kept*: without the time for the points of the map."""
 STAGES = """## Stages and their floor
 
-The floor of a stage is the processor time inside of its kernels: the functions of OpenCV that it calls (transforms,
-warps, filters, SIFT, KLT, poses), with these sizes and contents, measured in another replay of the same run. The ratio
-is that of the sums over all frames. The kernel of estimator and smoother is iSAM2, which evaluates factors in Python:
-they have no such floor. Decoding is measured by the clock alone."""
+The floor of a stage is the processor time inside of OpenCV functions that it calls, in another replay of the same
+run; the ratio is that of the sums over all frames. Estimator and smoother (iSAM2) have no such floor. Decoding
+is measured by the clock alone."""
 
 Table = list[list[str]]  # the first row is the head
 
@@ -84,7 +81,7 @@ def markdown(table: Table) -> str:
 def comparison_table(flight: dict[str, Any]) -> Table:
     table = [["", "within 20 m", "processor time", "... points kept", "frames with the model"]]
     for row in compared(flight):
-        found = f"{row.found} of {row.frames}"
+        found = f"{row.found}/{row.frames}"
         table.append([row.name, found, spread_text(row.cpu_ms), spread_text(row.kept_ms), percent_text(row.model_rate)])
     return table
 

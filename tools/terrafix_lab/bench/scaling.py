@@ -78,7 +78,7 @@ def flight_table(grown: dict[str, Any]) -> list[list[str]]:
         by_length.append({
             "": f"{one['frames']} frames",
             "one frame": f"{one['frame_cpu_ms']['median']:.1f} ms",
-            "graph alone (median / p99)": f"{update['median']:.1f} / {update['p99']:.1f} ms",
+            "graph alone (median/p99)": f"{update['median']:.1f}/{update['p99']:.1f} ms",
             **queries,
             "refinement": f"{one['refine_cpu_s']:.1f} s",
             "memory": f"{one['peak_memory_mb']:.0f} MB",

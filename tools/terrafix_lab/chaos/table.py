@@ -2,6 +2,7 @@
 
 import re
 import statistics
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,10 @@ from terrafix.core.errors import OutputError, SourceError
 from terrafix_lab.chaos.verdict import NO_FIX, Outcome
 from terrafix_lab.faults.fault import Phase
 from terrafix_lab.faults.table import FAULTS, MATRIX
+from terrafix_tools.report.text import GAP_S
+
+# A dark cell is without effect up to this time from the last black image to a fix.
+DARK_BACK_S = 1.5  # [measured: at most 1.4 s in docs/faults.md, of faults without an effect in the other phases]
 
 
 def line(outcome: Outcome) -> str:
@@ -27,27 +32,56 @@ def line(outcome: Outcome) -> str:
 
 
 def cell(outcome: Outcome | None) -> str:
-    """Silence, and time without a fix, in seconds; a broken promise in words."""
+    """Silence/time to a fix, in seconds; a broken promise in words; empty: no effect."""
     if outcome is None or outcome.verdict == NO_FIX:
         return "-"
     if outcome.silence_s is None:
         return outcome.verdict
-    figures = f"{_s(outcome.silence_s)}, {_s(outcome.back_s)}"
+    if is_without_effect(outcome):
+        return ""
+    back = "-" if outcome.back_s is None else f"{outcome.back_s:.1f}"
+    figures = f"{outcome.silence_s:.1f}/{back}"
     return figures if outcome.verdict == "ok" else f"{figures} **{outcome.verdict}**"
 
 
+def is_without_effect(outcome: Outcome) -> bool:
+    """GPS_INPUT kept its interval, and no fix was lost but the one of the dark."""
+    if outcome.verdict != "ok" or outcome.silence_s is None or outcome.back_s is None:
+        return False
+    return outcome.silence_s <= GAP_S and outcome.back_s <= (DARK_BACK_S if outcome.phase is Phase.DARK else 0.0)
+
+
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Faults by phases (those of MATRIX, others if flown; phases of which there is any outcome), and a line that sums
-    all cells up."""
-    found = {(o.fault, o.phase): o for o in outcomes}
+    """Faults with an effect by phases, of the phases of which there is any outcome; the names of the other faults that
+    were flown, and of those of MATRIX that were not; a line that sums all cells up."""
+    flown = [o for o in outcomes if o.verdict != NO_FIX]
     phases = [phase for phase in Phase if any(o.phase == phase for o in outcomes)]
     rows = [f"| fault | {' | '.join(phases)} |", f"|---|{'---|' * len(phases)}"]
+    quiet, missing = [], []
     for fault in FAULTS.values():
-        if fault not in MATRIX and not any((fault.name, phase) in found for phase in phases):
-            continue
-        cells = (cell(found.get((fault.name, phase))) for phase in phases)
-        rows.append(f"| {fault.name} | {' | '.join(cells)} |")
-    return "\n".join([*rows, "", _sum([o for o in outcomes if o.silence_s is not None and o.verdict != NO_FIX])])
+        of = {o.phase: o for o in flown if o.fault == fault.name}
+        if not of:
+            missing += [fault.name] if fault in MATRIX else []
+        elif len(of) == len(phases) and all(is_without_effect(o) for o in of.values()):
+            quiet.append(fault.name)
+        else:
+            rows.append(
+                f"| {fault.name} |" + "".join(f" {cell(of.get(phase))} |" for phase in phases).replace("  ", " ")
+            )
+    notes = [
+        f"{what}: {_grouped(names)}." for what, names in (("Without effect", quiet), ("Not flown", missing)) if names
+    ]
+    return "\n".join([*rows, "", *notes, *([""] if notes else []), _sum([o for o in flown if o.silence_s is not None])])
+
+
+def _grouped(names: Sequence[str]) -> str:
+    """Names of the form "part: fault" by what comes before the colon, in lines of a page."""
+    parts: dict[str, list[str]] = {}
+    for name in names:
+        part, colon, fault = name.partition(": ")
+        parts.setdefault(part, []).extend([fault] if colon else [])
+    text = "; ".join(f"{part}: {', '.join(faults)}" if faults else part for part, faults in parts.items())
+    return "\n".join(textwrap.wrap(text, 140))
 
 
 def _sum(flown: Sequence[Outcome]) -> str:

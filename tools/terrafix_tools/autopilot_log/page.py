@@ -1,16 +1,18 @@
 """An overlay as one HTML page without other files."""
 
 import math
-from html import escape
-from importlib.resources import files
 from typing import Any
 
 from terrafix_tools.autopilot_log.text import clock_line, percent
-from terrafix_tools.report.charts import Band, Chart, Point, strips
-from terrafix_tools.report.document import table
-from terrafix_tools.report.text import stamp
+from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
+from terrafix_tools.pages.document import Figure, kit
 
-COLOURS = (("one", "k-sat"), ("two", "k-vis"), ("three", "k-dead"), ("four", "k-good"))  # classes of line and key
+COLOURS = (
+    ("claim", "k-sat"),
+    ("age", "k-vis"),
+    ("temperature", "k-dead"),
+    ("refined", "k-good"),
+)  # classes of line and key
 NAME_WIDTH = 200  # SVG units for the name of a strip
 MAX_GAP_S = 5.0  # a line has a gap where samples are further apart [tuned]
 SPAN_COLOURS = ("f-accepted", "f-visual_propagated", "f-dead_reckoned", "f-good")  # of consecutive lanes, sets, modes
@@ -26,45 +28,43 @@ AXES = {"n": "north", "e": "east", "d": "down", "x": "forward", "y": "right", "z
 
 def page(found: dict[str, Any]) -> str:
     """``found``: what ``overlay`` returns."""
-    style = (files("terrafix_tools") / "assets" / "report.css").read_text(encoding="utf-8")
-    record, log = escape(found["record"]), found["log"]
-    name = escape(log["path"].rsplit("/", 1)[-1])
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{name} - autopilot's log</title><style>{style}</style></head><body><main>"
-        f'<header><div class="eyebrow">Terrafix, log of the autopilot on the time of a record</div><h1>{name}</h1>'
-        f"<p>{escape(log['kind'])} · {escape(log['firmware'] or 'unknown firmware')} · record {record}</p></header>"
-        f"{_figures(found)}{_events(found)}{_states(found)}{_ratios(found)}{_sent(found)}{_innovations(found)}"
-        f"{_receivers(found)}{_clock(found['clock'])}</main></body></html>\n"
+    log = found["log"]
+    name = log["path"].rsplit("/", 1)[-1]
+    about = f"{log['kind']} · {log['firmware'] or 'unknown firmware'} · record {found['record']}"
+    return kit.document(
+        f"{name} - autopilot's log",
+        "",
+        kit.header("Terrafix, log of the autopilot on the time of a record", name, about),
+        _figures(found),
+        _events(found),
+        _states(found),
+        _ratios(found),
+        _sent(found),
+        _innovations(found),
+        _receivers(found),
+        _clock(found["clock"]),
     )
 
 
 def _figures(found: dict[str, Any]) -> str:
     clock, ratios, sent = found["clock"], found["test_ratios"], found["sent_less_ekf"]
     tiles = [
-        (f"{found['to_s'] - found['from_s']:.0f}", "s", "", "of the record are in the log"),
-        (f"{1e3 * clock['offset_sigma_s']:.1f}", "ms", "", "standard error of the clocks' offset"),
-        (f"{clock['aligned_correlation']:.2f}", "", "", "correlation of the body rates"),
+        Figure(f"{found['to_s'] - found['from_s']:.0f}", "s", "of the record are in the log"),
+        Figure(f"{1e3 * clock['offset_sigma_s']:.1f}", "ms", "standard error of the clocks' offset"),
+        Figure(f"{clock['aligned_correlation']:.2f}", "", "correlation of the body rates"),
     ]
     if ratios:
         name, worst = max(ratios.items(), key=lambda item: item[1]["max"])
         mood = "good" if worst["max"] <= 1.0 else "bad"
-        tiles.append((f"{worst['max']:.2f}", "", mood, f"largest test ratio ({name})"))
+        tiles.append(Figure(f"{worst['max']:.2f}", "", f"largest test ratio ({name})", mood))
     if sent is not None:
-        tiles.append((f"{sent['median_m']:.1f}", "m", "", "GPS_INPUT from the EKF, median"))
-    cells = "".join(
-        f'<div><b class="{mood}">{value}<small>{unit}</small></b><span>{escape(text)}</span></div>'
-        for value, unit, mood, text in tiles
-    )
-    return f'<section class="figures">{cells}</section>'
+        tiles.append(Figure(f"{sent['median_m']:.1f}", "m", "GPS_INPUT from the EKF, median"))
+    return kit.figures(tiles)
 
 
 def _events(found: dict[str, Any]) -> str:
-    rows = "".join(
-        f"<li><time>{stamp(event['t_s'])}</time><span>{escape(_event(event))}</span></li>" for event in found["events"]
-    )
-    return f'<h2>Events</h2><ol class="moments">{rows}</ol>' if rows else "<h2>Events</h2><p>None.</p>"
+    rows = [(stamp(event["t_s"]), _event(event)) for event in found["events"]]
+    return kit.section("Events", "", kit.timeline(rows)) if rows else kit.section("Events", "None.")
 
 
 def _event(event: dict[str, Any]) -> str:
@@ -93,11 +93,11 @@ def _states(found: dict[str, Any]) -> str:
     shown = [band for band in bands if band.name != "mode" or band.spans]
     if not shown:
         return ""
-    return (
-        '<h2>Receivers and what is fused</h2><p class="lead">Fix: green is 3D, orange 2D, red none. Used: what '
-        "the autopilot has selected. EKF: what its primary core fuses or is. The pointer on a stretch shows "
-        "its name.</p>"
-        f'<div class="scroll">{strips(shown, found["duration_s"], "Receivers and fusion", NAME_WIDTH)}</div>'
+    return kit.section(
+        "Receivers and what is fused",
+        "Fix: green is 3D, orange 2D, red none. Used: what the autopilot has selected. EKF: what its primary core "
+        "fuses or is. The pointer on a stretch shows its name.",
+        kit.scroll(strips(shown, found["duration_s"], "Receivers and fusion", NAME_WIDTH)),
     )
 
 
@@ -110,7 +110,7 @@ def _coloured(spans: list[tuple[float, float, str]]) -> list[tuple[float, float,
 def _ratios(found: dict[str, Any]) -> str:
     ratios = found["test_ratios"]
     if not ratios:
-        return "<h2>Test ratios</h2><p>The log has none.</p>"
+        return kit.section("Test ratios", "The log has none.")
     shown = [name for name in ("velocity", "position", "height", "mag") if name in ratios] or list(ratios)[:4]
     top = max(MIN_RATIO_AXIS, *(ratios[name]["max"] for name in shown))
     chart = Chart(found["duration_s"], 0.0, 1.1 * top, y_unit="", follow=False)
@@ -121,11 +121,12 @@ def _ratios(found: dict[str, Any]) -> str:
         [name, ratio["max"], f"{ratio['max_at_s']:.1f} s", f"{100 * ratio['above_gate_share']:.1f} %"]
         for name, ratio in ratios.items()
     ]
-    return (
-        '<h2>Test ratios</h2><p class="lead">Innovation over the limit of its gate, primary core: above 1 the EKF '
-        f"rejects the measurement.</p>{_legend(shown)}"
-        f'<div class="scroll">{chart.svg("Test ratios over time")}</div>'
-        f"{table(['measurement', 'largest', 'at', 'above the gate'], rows)}"
+    return kit.section(
+        "Test ratios",
+        "Innovation over the limit of its gate, primary core: above 1 the EKF rejects the measurement.",
+        _legend(shown),
+        kit.scroll(chart.svg("Test ratios over time")),
+        kit.table(["measurement", "largest", "at", "above the gate"], rows),
     )
 
 
@@ -137,22 +138,22 @@ def _innovations(found: dict[str, Any]) -> str:
         if shown:
             series = [(name, innovations[name]["series"]) for name in shown]
             labels = [AXES.get(name.split("_")[1], "yaw") for name in shown]
-            parts.append(f"<h3>{title}</h3>{_legend(labels)}{_lines(found, series, unit, f'{title} innovations')}")
-    if not parts:
-        return "<h2>Innovations</h2><p>The log has none.</p>"
-    return f'<h2>Innovations</h2><p class="lead">Of the primary core of the EKF.</p>{"".join(parts)}'
+            parts.append(kit.block(title, _legend(labels), _lines(found, series, unit, f"{title} innovations")))
+    return kit.section("Innovations", "Of the primary core of the EKF." if parts else "The log has none.", *parts)
 
 
 def _sent(found: dict[str, Any]) -> str:
     sent = found["sent_less_ekf"]
     if sent is None:
-        return "<h2>GPS_INPUT against the EKF</h2><p>Nothing was sent, or the log has no position.</p>"
+        return kit.section("GPS_INPUT against the EKF", "Nothing was sent, or the log has no position.")
     series = [(name, sent[f"{name}_m"]) for name in ("north", "east", "down")]
-    return (
-        '<h2>GPS_INPUT against the EKF</h2><p class="lead">Position that was sent less the position that the autopilot '
-        f"navigated by at that time. Horizontal distance: median {sent['median_m']:.2f} m, 95 % {sent['p95_m']:.2f} m, "
-        f"at most {sent['max_m']:.2f} m at {sent['max_at_s']:.1f} s.</p>"
-        f"{_legend([name for name, _ in series])}{_lines(found, series, 'm', 'GPS_INPUT less EKF')}"
+    return kit.section(
+        "GPS_INPUT against the EKF",
+        "Position that was sent less the position that the autopilot navigated by at that time. Horizontal distance: "
+        f"median {sent['median_m']:.2f} m, 95 % {sent['p95_m']:.2f} m, at most {sent['max_m']:.2f} m "
+        f"at {sent['max_at_s']:.1f} s.",
+        _legend([name for name, _ in series]),
+        _lines(found, series, "m", "GPS_INPUT less EKF"),
     )
 
 
@@ -163,7 +164,7 @@ def _lines(found: dict[str, Any], series: list[tuple[str, list[list[float]]]], u
     chart.level(0.0)
     for (_, points), (css, _) in zip(series, COLOURS, strict=False):
         chart.line(_with_gaps(points), css)
-    return f'<div class="scroll">{chart.svg(label)}</div>'
+    return kit.scroll(chart.svg(label))
 
 
 def _with_gaps(points: list[list[float]]) -> list[Point]:
@@ -176,10 +177,7 @@ def _with_gaps(points: list[list[float]]) -> list[Point]:
 
 
 def _legend(names: list[str]) -> str:
-    keys = "".join(
-        f'<span><i class="key {css}"></i> {escape(name)}</span>' for name, (_, css) in zip(names, COLOURS, strict=False)
-    )
-    return f'<div class="legend">{keys}</div>'
+    return kit.legend((css, name) for name, (_, css) in zip(names, COLOURS, strict=False))
 
 
 def _receivers(found: dict[str, Any]) -> str:
@@ -195,7 +193,7 @@ def _receivers(found: dict[str, Any]) -> str:
         for receiver in found["gps"]
     ]
     columns = ["receiver", "samples", "3D fix", "used", "satellites, median", "stated accuracy, median"]
-    return f"<h2>Receivers</h2>{table(columns, rows)}" if rows else ""
+    return kit.section("Receivers", "", kit.table(columns, rows)) if rows else ""
 
 
 def _number(value: float | None, unit: str) -> str:
@@ -203,9 +201,9 @@ def _number(value: float | None, unit: str) -> str:
 
 
 def _clock(about: dict[str, Any]) -> str:
-    line = escape(clock_line(about).removeprefix("clocks: "))
-    return (
-        f'<h2>Clocks</h2><p class="lead">{line}. Line through the offsets '
-        f"of {about['windows']} windows, which scatter by {1e3 * about['scatter_s']:.1f} ms; the attitudes differ by "
-        f"{about['attitude_deg']:.2f} degrees (median).</p>"
+    return kit.section(
+        "Clocks",
+        f"{clock_line(about).removeprefix('clocks: ')}. Line through the offsets of {about['windows']} windows, which "
+        f"scatter by {1e3 * about['scatter_s']:.1f} ms; the attitudes differ by {about['attitude_deg']:.2f} degrees "
+        "(median).",
     )

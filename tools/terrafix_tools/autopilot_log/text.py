@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from terrafix_tools.autopilot_log.structure import AutopilotLog
-from terrafix_tools.report.charts import clock
+from terrafix_tools.pages.charts import clock
 
 MAX_MESSAGES = 40  # events that are shown in a terminal
 

@@ -18,7 +18,7 @@ from terrafix_tools.console.app import make_app
 from terrafix_tools.console.connections import BoundedProtocol
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.settings import Settings
-from terrafix_tools.parallel.pool import check_scheduler
+from terrafix_tools.parallel.scheduler import check_scheduler
 
 KEEP_ALIVE_S = 15  # idle connections are closed after this time
 STOP_S = 10  # longest wait for requests in progress at a stop
@@ -79,7 +79,6 @@ def config_of(app: FastAPI, settings: Settings) -> uvicorn.Config:
 def serve(settings: Settings) -> None:
     """Until SIGINT or SIGTERM. Raises UsageError, ConfigError, OutputError, LinkError (the port is taken)."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    logging.getLogger("alembic").setLevel(logging.WARNING)
     try:
         settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:

@@ -10,7 +10,8 @@ from pathlib import Path
 from terrafix_tools.fleet.examine import FLEET_BUILD, Examined, Examiner, WorkerDied
 from terrafix_tools.fleet.find import Place, Record, find_records, open_place
 from terrafix_tools.fleet.store import FleetFolder, open_fleet
-from terrafix_tools.parallel.pool import OpenRenderer, PoolProvider, Processes, connect, render_pieces
+from terrafix_tools.parallel.pool import OpenRenderer, PoolProvider, Processes, render_pieces
+from terrafix_tools.parallel.scheduler import connect
 from terrafix_tools.progress import progress_bar
 
 RECORDS_PER_WORKER = 4  # a process needs about a second to start, which fewer small records do not compensate

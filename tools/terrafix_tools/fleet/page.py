@@ -1,16 +1,15 @@
 """`terrafix fleet page`: trends of a fleet and where it fails, as one HTML page without other files."""
 
-from html import escape
-from importlib.resources import files
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from terrafix.core.errors import OutputError
-from terrafix_tools.fleet.places import Grid, grids, legend, picture, words, worst
+from terrafix_tools.fleet.places import KEYS, Grid, grids, picture, words, worst
 from terrafix_tools.fleet.query import FleetTables
-from terrafix_tools.report.charts import Chart, Point
-from terrafix_tools.report.document import document, table
+from terrafix_tools.pages.charts import Chart, Point
+from terrafix_tools.pages.document import Figure, kit, macros, write_file
 
+OWN = macros("terrafix_tools/fleet.html")
 MAX_GROUPS = 12  # rows of a trend
 LEAST_MONTHS = 5  # of the chart by month; over fewer the trend by season says as much
 MAX_MAPS, MAX_WORST, MAX_ERRORS = 12, 12, 20
@@ -40,22 +39,13 @@ def write_page(fleet: Path, out: Path) -> None:
     """Raises SourceError, UsageError, OutputError."""
     with FleetTables(fleet, keep=True) as tables:
         text = page(tables, fleet)
-    partial = out.with_name(f"{out.name}.partial")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(out)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+    write_file(out, text, "; choose another --out")
 
 
 def page(tables: FleetTables, fleet: Path) -> str:
     name = fleet.resolve().name
-    style = (files("terrafix_tools") / "assets" / "fleet.css").read_text(encoding="utf-8")
-    body = (
-        _head(tables, name) + _months(tables) + _trends(tables) + _reasons(tables) + _places(tables) + _errors(tables)
-    )
-    return document(f"{name} - fleet", body, style)
+    parts = (_head(tables, name), _months(tables), _trends(tables), _reasons(tables), _places(tables), _errors(tables))
+    return kit.document(f"{name} - fleet", "", *parts)
 
 
 def _head(tables: FleetTables, name: str) -> str:
@@ -63,23 +53,17 @@ def _head(tables: FleetTables, name: str) -> str:
     about = tables.ask(f"SELECT {MEASURES}, {more} FROM flights").objects()[0]
     sigma_m = tables.ask("SELECT median(sigma_m) FROM frames").rows[0][0]
     hours, km = about["hours"] or 0.0, about["km"] or 0.0
-    figures = [
-        (f"{about['flights']}", "", "flights"),
-        (f"{hours:.1f}", "h", "recorded") if hours >= 1 else (f"{60 * hours:.1f}", "min", "recorded"),
-        (f"{km:.0f}" if km >= 10 else f"{km:.1f}", "km", "flown"),
-        (_percent(about["availability"]), "%", "frames with a position"),
-        (_percent(about["refused"]), "%", "map matches refused"),
-        ("-" if sigma_m is None else f"{sigma_m:.1f}", "m", "stated 1-sigma, median"),
+    tiles = [
+        Figure(f"{about['flights']}", "", "flights"),
+        Figure(f"{hours:.1f}", "h", "recorded") if hours >= 1 else Figure(f"{60 * hours:.1f}", "min", "recorded"),
+        Figure(f"{km:.0f}" if km >= 10 else f"{km:.1f}", "km", "flown"),
+        Figure(_percent(about["availability"]), "%", "frames with a position"),
+        Figure(_percent(about["refused"]), "%", "map matches refused"),
+        Figure("-" if sigma_m is None else f"{sigma_m:.1f}", "m", "stated 1-sigma, median"),
     ]
-    tiles = "".join(
-        f"<div><b>{value}<small>{unit}</small></b><span>{text}</span></div>" for value, unit, text in figures
-    )
     dates = f"{about['first']} to {about['last']}" if about["first"] else "no flight has a date"
     dates += f"; {about['replays']} of the flights are replays" if about["replays"] else ""
-    return (
-        f'<header><div class="eyebrow">Terrafix fleet</div><h1>{escape(name)}</h1><p>{dates}</p></header>'
-        f'<section class="figures">{tiles}</section>'
-    )
+    return kit.header("Terrafix fleet", name, dates) + kit.figures(tiles)
 
 
 def _months(tables: FleetTables) -> str:
@@ -111,18 +95,21 @@ def _months(tables: FleetTables) -> str:
         for month, row in zip(at, rows, strict=True)
     ]
     chart.line(without, "none")
-    return (
-        f'<h2>By month</h2><p class="lead">Months from January {rows[0]["month"].year}. Bars: share of the map matches '
-        "that were refused; line: frames without a position.</p>"
-        f'<div class="scroll">{chart.svg("Refused map matches by month")}</div>'
+    return kit.section(
+        "By month",
+        f"Months from January {rows[0]['month'].year}. Bars: share of the map matches that were refused; line: frames "
+        "without a position.",
+        kit.scroll(chart.svg("Refused map matches by month")),
     )
 
 
 def _trends(tables: FleetTables) -> str:
-    blocks = [_trend(tables, title, group) for title, group in GROUPS]
-    return (
-        '<h2>Trends</h2><p class="lead">Shares of all frames of a group; sigma is the median of the stated horizontal '
-        f"1-sigma. {_keys()}</p>{''.join(blocks)}"
+    return kit.section(
+        "Trends",
+        "Shares of all frames of a group; sigma is the median of the stated horizontal 1-sigma. Refused: map matches "
+        "that a check has rejected, of all frames that were matched. Of a flight without a date (a replay) the season "
+        "is unknown.",
+        *(_trend(tables, title, group) for title, group in GROUPS),
     )
 
 
@@ -131,36 +118,28 @@ def _trend(tables: FleetTables, title: str, group: str) -> str:
     sigmas = dict(tables.ask(SIGMAS.format(group=group)).rows)
     shown = sorted(rows[:MAX_GROUPS], key=lambda row: _order(row["name"]))
     most = max([value for value in sigmas.values() if value is not None], default=1.0)
-    lines = "".join(_group(title, row, sigmas.get(row["name"]), most) for row in shown)
-    more = f'<p class="quiet">and {len(rows) - MAX_GROUPS} more</p>' if len(rows) > MAX_GROUPS else ""
+    lines = [_group(title, row, sigmas.get(row["name"]), most) for row in shown]
     heads = ("", "flights", "hours", "with a position", "refused", "sigma")
-    return (
-        f'<h3>{escape(title)}</h3><div class="scroll"><table class="trend"><thead><tr>'
-        f"{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead><tbody>{lines}</tbody></table></div>{more}"
-    )
+    return kit.block(title, kit.table(heads, lines, css="trend"), _more(rows, MAX_GROUPS))
 
 
-def _group(title: str, row: dict[str, Any], sigma_m: float | None, most_m: float) -> str:
+def _more(found: Sequence[Any], shown: int, what: str = "") -> str:
+    return kit.quiet(f"and {len(found) - shown} more{what}") if len(found) > shown else ""
+
+
+def _group(title: str, row: dict[str, Any], sigma_m: float | None, most_m: float) -> list[object]:
     name = "unknown" if row["name"] in (None, "") else str(row["name"])
     if title == HEIGHT and row["name"] is not None:
         name = f"{row['name']} to {row['name'] + 50} m"
     sigma = "-" if sigma_m is None else f"{sigma_m:.1f} m"
-    return (
-        f"<tr><td>{escape(name)}</td><td>{row['flights']}</td><td>{row['hours'] or 0:.2f}</td>"
-        f"{_bar(row['availability'], 'k-good')}{_bar(row['refused'], 'k-dead')}"
-        f'<td><u class="k-claim" style="width:{100 * (sigma_m or 0) / max(most_m, 1e-9):.1f}%"></u>{sigma}</td></tr>'
-    )
-
-
-def _bar(share: float | None, css: str) -> str:
-    return f'<td><u class="{css}" style="width:{100 * (share or 0):.1f}%"></u>{_percent(share)} %</td>'
-
-
-def _keys() -> str:
-    return (
-        "Refused: map matches that a check has rejected, of all frames that were matched. Of a flight without a date "
-        "(a replay) the season is unknown."
-    )
+    return [
+        name,
+        row["flights"],
+        f"{row['hours'] or 0:.2f}",
+        kit.share_bar(row["availability"] or 0, "k-good", f"{_percent(row['availability'])} %"),
+        kit.share_bar(row["refused"] or 0, "k-dead", f"{_percent(row['refused'])} %"),
+        kit.share_bar((sigma_m or 0) / max(most_m, 1e-9), "k-claim", sigma),
+    ]
 
 
 def _order(name: Any) -> tuple[int, Any]:
@@ -176,30 +155,27 @@ def _reasons(tables: FleetTables) -> str:
     rows = tables.ask(REASONS).objects()
     if not rows:
         return ""
-    total = sum(row["frames"] for row in rows)
-    lines = "".join(
-        f'<div><span>{escape(words(row["reason"]))}</span><u class="k-dead" '
-        f'style="width:{100 * row["frames"] / total:.1f}%"></u>'
-        f"<span>{row['frames']} · {100 * row['frames'] / total:.0f} %</span></div>"
-        for row in rows
+    return kit.section(
+        "Reasons of refusal", "", kit.counts([(words(row["reason"]), row["frames"], "k-dead") for row in rows])
     )
-    return f'<h2>Reasons of refusal</h2><div class="verdict">{lines}</div>'
 
 
 def _places(tables: FleetTables) -> str:
     found = grids(tables)
     if not found:
         return ""
-    shown = "".join(
-        f"<div><h3>{escape(grid.map or 'map unknown')}</h3>"
-        f'<p class="quiet">{grid.frames} frames, cells of {grid.cell_m} m</p>{picture(grid)}</div>'
+    shown = [
+        (grid.map or "map unknown", f"{grid.frames} frames, cells of {grid.cell_m} m", picture(grid))
         for grid in found[:MAX_MAPS]
-    )
-    more = f'<p class="quiet">and {len(found) - MAX_MAPS} more maps</p>' if len(found) > MAX_MAPS else ""
-    return (
-        '<h2>Where it fails</h2><p class="lead">Share of the matched frames in each cell that were refused, north up. '
-        "A frame without a position is in no cell.</p>"
-        f'{legend()}<div class="two places">{shown}</div>{more}{_worst(found)}'
+    ]
+    return kit.section(
+        "Where it fails",
+        "Share of the matched frames in each cell that were refused, north up. "
+        "A frame without a position is in no cell.",
+        kit.legend(KEYS),
+        OWN.places(shown),
+        _more(found, MAX_MAPS, " maps"),
+        _worst(found),
     )
 
 
@@ -217,17 +193,15 @@ def _worst(found: list[Grid]) -> str:
         ]
         for grid, cell in cells
     ]
-    return f"<h3>Worst cells</h3>{table(['map', 'latitude, longitude', 'frames', 'refused', 'mostly'], rows)}"
+    return kit.block("Worst cells", kit.table(["map", "latitude, longitude", "frames", "refused", "mostly"], rows))
 
 
 def _errors(tables: FleetTables) -> str:
     rows = tables.ask("SELECT record, error FROM errors ORDER BY record").rows
     if not rows:
         return ""
-    more = f'<p class="quiet">and {len(rows) - MAX_ERRORS} more</p>' if len(rows) > MAX_ERRORS else ""
-    return (
-        f"<h2>Records that could not be read</h2>{table(['record', 'reason'], [[*r] for r in rows[:MAX_ERRORS]])}{more}"
-    )
+    shown = kit.table(["record", "reason"], rows[:MAX_ERRORS])
+    return kit.section("Records that could not be read", "", shown, _more(rows, MAX_ERRORS))
 
 
 def _percent(share: float | None) -> str:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
+from markupsafe import Markup
+
 from terrafix_tools.fleet.query import FleetTables
 
 MAX_CELLS = 30  # along the longer side
@@ -13,6 +15,8 @@ LEAST_FRAMES = 5  # of a cell whose share is shown; that of fewer says little
 METRES_PER_DEG = 111_320.0  # of latitude; sizes of cells need no more than 1 %
 # Upper ends of the classes of the share of refused frames, and what the legend says.
 CLASSES = ((0.05, "under 5 %"), (0.15, "5 to 15 %"), (0.3, "15 to 30 %"), (0.6, "30 to 60 %"), (1.01, "60 % and more"))
+KEYS = [(f"cell c{i}", text) for i, (_, text) in enumerate(CLASSES)]  # of the legend
+KEYS += [("cell few", f"small: fewer than {LEAST_FRAMES} frames")]
 LEAST_COLUMNS = 20  # of a picture, so that few cells are not drawn large
 PX = 12  # side of a cell, SVG units
 MARGIN_PX = 22  # below the grid, for the scale
@@ -95,18 +99,12 @@ def picture(grid: Grid) -> str:
     scale = max(1, max(grid.columns, LEAST_COLUMNS) // 4)
     y = height + MARGIN_PX / 2
     label = f"Share of refused frames on {grid.map or 'an unknown map'}"
-    return (
+    return Markup(
         f'<svg class="places" viewBox="-2 -2 {width + 4} {height + MARGIN_PX + 2}" role="img" '
         f'aria-label="{escape(label)}"><rect class="rail" width="{width}" height="{height}"/>{marks}'
         f'<path class="ruler" d="M0 {y - 3}v6M0 {y}h{scale * PX}m0 -3v6"/>'
         f'<text x="{scale * PX + 5}" y="{y + 3.5}">{_length(scale * grid.cell_m)}</text></svg>'
     )
-
-
-def legend() -> str:
-    items = [f'<span><i class="cell c{i}"></i>{text}</span>' for i, (_, text) in enumerate(CLASSES)]
-    few = f'<span><i class="cell few"></i>small: fewer than {LEAST_FRAMES} frames</span>'
-    return f'<div class="legend">{"".join(items)}{few}</div>'
 
 
 def worst(found: list[Grid], count: int) -> list[tuple[Grid, Cell]]:

@@ -11,12 +11,9 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import forkserver, resource_tracker
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
-from terrafix.core.errors import TerrafixError, UsageError
-
-if TYPE_CHECKING:
-    from terrafix_tools.parallel.cluster import DaskCluster
+from terrafix.core.errors import TerrafixError
 
 CHUNKS_PER_WORKER = 8  # imagery chunks of 0.1 s; a process needs a second to start, fewer chunks do not compensate it
 MAX_PENDING_PER_WORKER = (
@@ -89,28 +86,6 @@ def default_workers() -> int:
     """One per core that this process may use, at most MAX_DEFAULT_WORKERS."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, MAX_DEFAULT_WORKERS)
-
-
-def connect(address: str, workload: Workload) -> "DaskCluster":
-    """The Dask cluster of ``--scheduler``. Raises UsageError: Dask is not installed, or no scheduler answers."""
-    with _dask_named():
-        from terrafix_tools.parallel.cluster import DaskCluster
-    return DaskCluster(address, workload)
-
-
-def check_scheduler(address: str) -> None:
-    """Raises UsageError as ``connect``, which a program calls later."""
-    with _dask_named():
-        from terrafix_tools.parallel.cluster import check_address
-    check_address(address)
-
-
-@contextlib.contextmanager
-def _dask_named() -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise UsageError(f"--scheduler needs {error.name}; install it: pip install 'terrafix[cluster]'") from None
 
 
 def render_pieces(

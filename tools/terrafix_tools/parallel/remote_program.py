@@ -12,7 +12,8 @@ from multiprocessing.connection import Client, Connection, Listener, wait
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from terrafix_tools.parallel.pool import Workload, connect
+from terrafix_tools.parallel.pool import Workload
+from terrafix_tools.parallel.scheduler import connect
 
 if TYPE_CHECKING:
     from distributed import Future

@@ -1,6 +1,5 @@
 """A crop of the map with the heading of a frame, so that map and frame can be compared by eye."""
 
-import base64
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.map.package import LocalMap, MapPackage
-from terrafix_tools.report.map_picture import VOID_BGR
+from terrafix_tools.pages.pictures import VOID_BGR, jpeg_uri
 
 MARGIN = 0.12  # around what is shown, as a share of its extent
 MAX_FRAMES = 2.5  # largest width of a crop, in widths of the frame
@@ -89,5 +88,4 @@ def picture(crop: Crop, local: LocalMap) -> str | None:
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    _, coded = cv2.imencode(".jpg", turned, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return "data:image/jpeg;base64," + base64.b64encode(bytes(coded)).decode()
+    return jpeg_uri(turned, JPEG_QUALITY)

@@ -1,26 +1,25 @@
 """The track over the map: a map window as an inlined JPEG, with vector layers on top."""
 
-import base64
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
+from markupsafe import Markup
 
-from terrafix.core.errors import MapError
 from terrafix.core.geodesy import LocalFrame
-from terrafix.map.package import MapPackage
 from terrafix_tools.estimates import Row
+from terrafix_tools.pages.document import kit
+from terrafix_tools.pages.pictures import VOID_BGR, jpeg_uri
+from terrafix_tools.pages.series import thin_path
 from terrafix_tools.report.data import FlightView, ellipse95
-from terrafix_tools.report.series import thin_path
+from terrafix_tools.report.map_crop import open_map
 
 WIDTH_PX = 1280  # of the inlined image: sharp on a laptop, about 300 kB
 MARGIN = 0.12  # margin around the track, as a share of its extent
 MIN_SPAN_M = 160.0  # least extent, so that a hovering flight shows some ground
 ASPECT = (1.25, 2.0)  # smallest and largest aspect ratio (width over height)
 JPEG_QUALITY = 80
-VOID_BGR = (226, 230, 230)  # colour outside the map
 ELLIPSE_SPACING = 1.1  # spacing of ellipses in units of their length, so that they do not hide the track
 MIN_SPACING_PX = 24.0
 MIN_STEP_PX = 0.7  # of a track
@@ -53,23 +52,21 @@ def map_svg(view: FlightView, map_path: Path | None, marked: list[int], pointed:
     if not points and view.origin is not None:
         points = [(view.origin.lat_deg, view.origin.lon_deg)]
     if not points:
-        return '<p class="quiet">No position in this record.</p>'
+        return kit.quiet("No position in this record.")
     map_image = _map_image(points)
     u = map_image.width_px / 1000  # unit of line widths, constant across image sizes
     body = [
         _ground(map_image, map_path),
         _ellipses(view, map_image),
         _estimates(view, map_image),
-        _refined(view, map_image),
-        _finalised(view, map_image),
-        _truth(view, map_image),
+        _tracks(view, map_image),
         _frame_dots(view, map_image, u, pointed),
         _end_labels(view, map_image, u),
         _numbers(view, map_image, u, marked),
         _scale_bar(map_image, u),
         '<circle id="here" r="0"/>',
     ]
-    return (
+    return Markup(
         f'<svg id="map" viewBox="0 0 {map_image.width_px} {map_image.height_px}" style="--u:{u:.3f}px" role="img" '
         f'aria-label="Track over the map">{"".join(body)}</svg>'
     )
@@ -96,21 +93,16 @@ def _map_image(points: list[tuple[float, float]]) -> MapImage:
 
 def _ground(map_image: MapImage, map_path: Path | None) -> str:
     size = f'width="{map_image.width_px}" height="{map_image.height_px}"'
-    if map_path is None:
+    opened = open_map(map_path, map_image.frame)
+    if opened is None:
         return f'<rect class="void" {size}/>'
-    try:
-        package = MapPackage.open(map_path)
-    except MapError:
-        return f'<rect class="void" {size}/>'
-    local = package.bind(map_image.frame)
+    package, local = opened
     image, valid = local.window(
         map_image.e_min_m, map_image.n_max_m, map_image.width_px, map_image.height_px, map_image.gsd_m
     )
     package.close()
     image[~valid] = VOID_BGR
-    _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    uri = base64.b64encode(bytes(coded)).decode()
-    return f'<image class="ground" {size} href="data:image/jpeg;base64,{uri}"/>'
+    return f'<image class="ground" {size} href="{jpeg_uri(image, JPEG_QUALITY)}"/>'
 
 
 def _xy(row: Row, map_image: MapImage) -> tuple[float, float] | None:
@@ -145,25 +137,20 @@ def _ellipses(view: FlightView, map_image: MapImage) -> str:
     return f'<g class="layer ellipses">{"".join(parts)}</g>'
 
 
-def _truth(view: FlightView, map_image: MapImage) -> str:
-    if not view.truth_track:
-        return ""
-    points = [map_image.pixel(t.lat_deg, t.lon_deg) for t in view.truth_track]
-    return f'<g class="layer truth">{_line(points, "casing")}{_line(points, "")}</g>'
-
-
-def _refined(view: FlightView, map_image: MapImage) -> str:
-    points = [
-        map_image.pixel(r.refined_lat_deg, r.refined_lon_deg)
+def _tracks(view: FlightView, map_image: MapImage) -> str:
+    """The refined and the finalised track, and that of the truth on top."""
+    refined = [
+        (r.refined_lat_deg, r.refined_lon_deg)
         for r in view.rows
         if r.refined_lat_deg is not None and r.refined_lon_deg is not None
     ]
-    return f'<g class="layer refined">{_line(points, "casing")}{_line(points, "")}</g>' if points else ""
-
-
-def _finalised(view: FlightView, map_image: MapImage) -> str:
-    points = [map_image.pixel(*pixel) for pixel in view.finalised]
-    return f'<g class="layer finalised">{_line(points, "casing")}{_line(points, "")}</g>' if points else ""
+    truth = [(t.lat_deg, t.lon_deg) for t in view.truth_track]
+    parts = []
+    for css, places in (("refined", refined), ("finalised", view.finalised), ("truth", truth)):
+        points = [map_image.pixel(*place) for place in places]
+        if points:
+            parts.append(f'<g class="layer {css}">{_line(points, "casing")}{_line(points, "")}</g>')
+    return "".join(parts)
 
 
 def _estimates(view: FlightView, map_image: MapImage) -> str:

@@ -1,10 +1,10 @@
 """Pictures of a moment: the frame with its matches, and the map around the estimate at the same scale and heading."""
 
-import base64
 import math
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
@@ -12,6 +12,7 @@ from terrafix.map.package import LocalMap
 from terrafix.messages import Origin
 from terrafix_tools.estimates import Row
 from terrafix_tools.evaluate import Truth
+from terrafix_tools.pages.pictures import data_uri
 from terrafix_tools.report.data import ellipse95
 from terrafix_tools.report.map_crop import Crop, crop_around, picture
 from terrafix_tools.report.moment_geometry import (
@@ -77,7 +78,7 @@ def pictures(
 
 def _frame(jpeg: bytes | None, camera: CameraCalibration, matches: Matches | None, pose: Pose | None) -> str:
     """Marks at the matched points; lines to where the estimate puts their places on the map."""
-    uri = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode() if jpeg is not None else None
+    uri = data_uri("image/jpeg", jpeg) if jpeg is not None else None
     parts = [_image(uri, camera.width, camera.height)]
     if matches is not None:
         seen = camera.project(np.column_stack([matches.xy, np.ones(len(matches.xy))]))
@@ -139,4 +140,6 @@ def _image(uri: str | None, width: int, height: int) -> str:
 
 
 def _svg(width: int, height: int, label: str, parts: list[str]) -> str:
-    return f'<svg class="shot" viewBox="0 0 {width} {height}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+    return Markup(
+        f'<svg class="shot" viewBox="0 0 {width} {height}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+    )

@@ -3,7 +3,7 @@
 from typing import TypeVar
 
 from terrafix.messages import MeasurementVerdict, SearchStep, Verdict
-from terrafix_tools.report.charts import clock
+from terrafix_tools.pages.charts import clock
 from terrafix_tools.report.data import FlightView, radius95_m
 from terrafix_tools.report.moment_record import FrameRecord
 from terrafix_tools.report.moments import Moment

@@ -27,7 +27,7 @@ import numpy as np
 from terrafix.link.pilot_text.statustext import fault_text
 from terrafix.messages import SearchStep
 from terrafix_tools.estimates import NS
-from terrafix_tools.report.charts import clock
+from terrafix_tools.pages.charts import clock
 from terrafix_tools.report.data import FlightView, radius95_m
 from terrafix_tools.report.text import FIX_3D, GAP_S, UNPLANNED
 

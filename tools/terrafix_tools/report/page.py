@@ -1,14 +1,11 @@
 """`terrafix report`: one self-contained HTML page about a flight."""
 
-import json
-from html import escape
-from importlib.resources import files
 from pathlib import Path
 
-from terrafix.core.errors import OutputError
 from terrafix_tools.estimates import Row
 from terrafix_tools.flight_map import map_of_flight
-from terrafix_tools.report.charts import clock
+from terrafix_tools.pages.charts import clock, stamp
+from terrafix_tools.pages.document import kit, macros, write_file
 from terrafix_tools.report.data import FlightView, radius95_m
 from terrafix_tools.report.gather import gather
 from terrafix_tools.report.map_picture import map_svg
@@ -20,11 +17,17 @@ from terrafix_tools.report.sections_gnss import gnss
 from terrafix_tools.report.sections_innovations import innovations
 from terrafix_tools.report.sections_moments import moments_sections
 from terrafix_tools.report.sections_run import camera_images, finalised, picture_rows, provenance, timing
-from terrafix_tools.report.text import events, figures, stamp
+from terrafix_tools.report.text import events
+from terrafix_tools.report.text import figures as key_figures
 
+OWN = macros("terrafix_tools/report.html")
 NAME = "report.html"
+SOURCE_KEYS = (  # css class, text, source of the estimate
+    ("k-sat", "map match", "satellite_anchored"),
+    ("k-vis", "propagated by odometry", "visual_propagated"),
+    ("k-dead", "dead reckoning", "dead_reckoned"),
+)
 MAX_POINTED = 2500  # frames that the pointer finds on the map and in the charts; of a longer flight, evenly spread ones
-MAX_IN_ROW = 7  # number of figures in one row; more are set in two even rows
 
 
 def report(folder: Path, truth_path: Path | None = None, map_path: Path | None = None) -> Path:
@@ -34,14 +37,8 @@ def report(folder: Path, truth_path: Path | None = None, map_path: Path | None =
     """
     view = gather(folder, truth_path)
     page = _page(view, map_of_flight(folder, map_path, view.summary, view.header))
-    target = folder / NAME
-    partial = folder / (NAME + ".partial")
-    try:
-        partial.write_text(page, encoding="utf-8")
-        partial.replace(target)
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written ({error.strerror})") from None
-    return target
+    write_file(folder / NAME, page)
+    return folder / NAME
 
 
 def _page(view: FlightView, map_path: Path | None) -> str:
@@ -66,18 +63,8 @@ def _page(view: FlightView, map_path: Path | None) -> str:
         camera_images(view),
         provenance(view),
     ]
-    tips = [{"i": i, "t": round(view.rows[i].t_s, 3), "h": _tip(view, view.rows[i])} for i in pointed]
-    data = json.dumps(tips).replace("</", "<\\/")
-    assets = files("terrafix_tools") / "assets"
-    style = (assets / "report.css").read_text(encoding="utf-8")
-    script = (assets / "report.js").read_text(encoding="utf-8")
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{escape(view.title)} - flight report</title><style>{style}</style></head><body><main>"
-        f'{_head(view)}{"".join(sections)}</main><div id="tip"></div>'
-        f'<script type="application/json" id="frames">{data}</script><script>{script}</script></body></html>\n'
-    )
+    frames = [{"i": i, "t": round(view.rows[i].t_s, 3), "h": _tip(view, view.rows[i])} for i in pointed]
+    return kit.document(f"{view.title} - flight report", OWN.pointed(frames), *_head(view), *sections)
 
 
 def pointed_rows(view: FlightView, moments: list[Moment]) -> list[int]:
@@ -87,7 +74,7 @@ def pointed_rows(view: FlightView, moments: list[Moment]) -> list[int]:
     return sorted(chosen)
 
 
-def _head(view: FlightView) -> str:
+def _head(view: FlightView) -> tuple[str, str]:
     kind = "live record" if view.live else "replay, unfinished" if view.unfinished else "replay"
     named = view.summary.get("map", {})
     facts = [
@@ -95,70 +82,43 @@ def _head(view: FlightView) -> str:
         f"map {Path(named['source']).stem}" if named.get("source") else "",
         ", ".join(view.summary.get("models", {})) or ("" if view.live else "no learned model"),
     ]
-    shown = figures(view)
-    tiles = "".join(
-        f'<div><b class="{f.mood}">{escape(f.value)}<small>{escape(f.unit)}</small></b>'
-        f"<span>{escape(f.name)}</span></div>"
-        for f in shown
-    )
-    wide = " wide" if len(shown) > MAX_IN_ROW else ""
-    line = " · ".join(escape(fact) for fact in facts if fact)
-    return (
-        f'<header><div class="eyebrow">Terrafix flight report, {kind}</div><h1>{escape(view.title)}</h1>'
-        f'<p>{line}</p></header><section class="figures{wide}">{tiles}</section>'
-    )
+    line = " · ".join(fact for fact in facts if fact)
+    return kit.header(f"Terrafix flight report, {kind}", view.title, line), kit.figures(key_figures(view))
 
 
 def _map_section(view: FlightView, map_path: Path | None, moments: list[Moment], pointed: list[int]) -> str:
     svg = map_svg(view, map_path, [moment.row for moment in moments], pointed)
     labels = {row.source_label for row in view.rows}
-    keys = [
-        ("k-sat", "map match", "satellite_anchored"),
-        ("k-vis", "propagated by odometry", "visual_propagated"),
-        ("k-dead", "dead reckoning", "dead_reckoned"),
-    ]
-    shown = "".join(f'<span><i class="key {css}"></i> {text}</span>&ensp;' for css, text, key in keys if key in labels)
-    layers = [("estimates", shown or "estimates", True)]
+    keys = [(css, text) for css, text, label in SOURCE_KEYS if label in labels]
+    layers = [("estimates", True, keys or [("", "estimates")])]
     if view.truth_track:
-        layers.append(("truth", '<i class="key k-truth"></i> ground truth', True))
+        layers.append(("truth", True, [("k-truth", "ground truth")]))
     if any(row.refined_lat_deg is not None for row in view.rows):
-        layers.append(("refined", '<i class="key k-refined"></i> refined afterwards', False))
+        layers.append(("refined", False, [("k-refined", "refined afterwards")]))
     if view.finalised:
-        layers.append(("finalised", '<i class="key k-finalised"></i> finalised after landing', True))
-    layers.append(("ellipses", "95 % ellipses", True))
+        layers.append(("finalised", True, [("k-finalised", "finalised after landing")]))
+    layers.append(("ellipses", True, [("", "95 % ellipses")]))
     if moments:
-        layers.append(("worst-marks", "worst moments", True))
-    boxes = "".join(
-        f'<label><input type="checkbox" data-layer="{name}"{" checked" if on else ""}>{text}</label>'
-        for name, text, on in layers
-    )
-    buttons = (
-        '<div class="zoom"><button data-k=".6" aria-label="nearer">+</button>'
-        '<button data-k="1.667" aria-label="farther">−</button></div>'
-    )
-    return f'<div class="stage">{svg}{buttons}</div><div class="legend">{boxes}</div>'
+        layers.append(("worst-marks", True, [("", "worst moments")]))
+    return OWN.map(svg, layers)
 
 
 def _events(view: FlightView) -> str:
-    rows = "".join(f"<li><time>{stamp(t)}</time><span>{escape(text)}</span></li>" for t, text in events(view))
-    return f'<h2>Events</h2><ol class="moments">{rows}</ol>'
+    return kit.section("Events", "", kit.timeline((stamp(t), text) for t, text in events(view)))
 
 
 def _tip(view: FlightView, row: Row) -> str:
     """HTML tooltip of a frame."""
-    lines = [f"<b>{escape(row.file) or 'frame'}</b> <span>{clock(round(row.t_s, 1))}</span>"]
-    if not row.localised:
-        lines.append("no position")
-    else:
-        lines.append(escape(row.source_label.replace("_", " ")))
-        if (error := view.error_m(row)) is not None:
-            lines.append(f"error <b>{error:.1f} m</b>")
+    error, lines = "", []
+    if row.localised:
+        if (error_m := view.error_m(row)) is not None:
+            error = f"{error_m:.1f} m"
         if (radius := radius95_m(row)) is not None:
             lines.append(f"reported 95 % radius {radius:.1f} m")
         if row.anchor_age_ms is not None and row.anchor_age_ms >= 0:
             lines.append(f"last map match {row.anchor_age_ms / 1000:.1f} s ago")
         if row.agl_m is not None:
             lines.append(f"{row.agl_m:.0f} m above ground")
-    if row.process_ms is not None:
-        lines.append(f"<span>{row.process_ms:.0f} ms</span>")
-    return "<br>".join(lines)
+    words = row.source_label.replace("_", " ") if row.localised else "no position"
+    process = f"{row.process_ms:.0f} ms" if row.process_ms is not None else ""
+    return OWN.tip(row.file, clock(round(row.t_s, 1)), words, error, lines, process)

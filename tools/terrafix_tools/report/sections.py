@@ -1,9 +1,9 @@
 """Upper sections of the report: accuracy, states, verdicts. Each returns HTML, or "" when there is no data."""
 
-from html import escape
 from typing import Any
 
-from terrafix_tools.report.charts import HALF_WIDTH, Band, Chart, Point, clock, spans_of, strips
+from terrafix_tools.pages.charts import HALF_WIDTH, Band, Chart, Point, spans_of, stamp, strips
+from terrafix_tools.pages.document import kit
 from terrafix_tools.report.data import FlightView, RejectedMatch, radius95_m
 
 MAX_REJECTED = 20  # rows of the table of rejected map matches
@@ -41,12 +41,13 @@ def accuracy(view: FlightView) -> str:
     keys = [("k-ink", "error of the immediate estimate"), ("k-claim", "reported 95 % radius")]
     if any(v is not None for _, v in refined):
         keys.insert(1, ("k-good", "error after refinement"))
-    return (
-        "<h2>Error and reported accuracy</h2>"
-        '<p class="lead">Consistent accuracy: the error is inside the shaded 95 % radius in 95 of 100 frames, '
-        "and the radius is not larger than necessary.</p>"
-        f'<div class="scroll">{chart.svg("Error and reported radius over time")}</div>'
-        f"{legend(keys)}{_cumulative(view)}"
+    return kit.section(
+        "Error and reported accuracy",
+        "Consistent accuracy: the error is inside the shaded 95 % radius in 95 of 100 frames, and the radius is not "
+        "larger than necessary.",
+        kit.scroll(chart.svg("Error and reported radius over time")),
+        kit.legend(keys),
+        _cumulative(view),
     )
 
 
@@ -62,10 +63,11 @@ def _reported_only(view: FlightView, reported: list[Point], top: float) -> str:
     second = Chart(x_max=end_s(view), y_min=0.0, y_max=max(2.0, oldest * 1.1), height=150, y_unit="s")
     second.area(age, "age")
     second.line(age, "age")
-    return (
-        '<h2>Reported accuracy</h2><p class="lead">Radius of the reported 95 % ellipse; below it the time since the '
-        "last accepted map match. There is no ground truth for this flight.</p>"
-        f'<div class="scroll">{chart.svg("Reported radius over time")}{second.svg("Age of the last map match")}</div>'
+    return kit.section(
+        "Reported accuracy",
+        "Radius of the reported 95 % ellipse; below it the time since the last accepted map match. There is no ground "
+        "truth for this flight.",
+        kit.scroll(chart.svg("Reported radius over time"), second.svg("Age of the last map match")),
     )
 
 
@@ -93,13 +95,9 @@ def _cumulative(view: FlightView) -> str:
     for errors, css in ((refined, "refined"), (immediate, "error")):
         steps: list[Point] = [(max(1.0, e), 100 * (i + 1) / total) for i, e in enumerate(errors)]
         chart.line([*steps, (top, 100 * len(errors) / total)] if steps else [], css)
-    rows = "".join(
-        f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>"
-        for name, value in _accuracy_rows(view.evaluation or {})
-    )
-    return (
-        f'<div class="two" style="margin-top:34px"><div><h3>Share of frames within a distance of the truth</h3>'
-        f"{chart.svg('Cumulative error')}</div><div><h3>Metrics</h3><table>{rows}</table></div></div>"
+    return kit.two(
+        kit.block("Share of frames within a distance of the truth", chart.svg("Cumulative error")),
+        kit.block("Metrics", kit.facts(_accuracy_rows(view.evaluation or {}))),
     )
 
 
@@ -129,7 +127,7 @@ def states(view: FlightView) -> str:
     for from_s, to_s, verdict in spans_of([(t, v) for t, v in matches], end):
         if verdict:
             css = "f-accepted" if verdict == "accepted" else "f-rejected"
-            ticks.append((from_s, to_s, css, f"{clock(round(from_s))}  {verdict.replace('_', ' ')}"))
+            ticks.append((from_s, to_s, css, f"{stamp(from_s)}  {verdict.replace('_', ' ')}"))
     bands.append(Band("map", ticks))
     bands.append(Band("covar.", spans([(r.t_s, r.covariance_mode) for r in view.rows], end, "f-", {"": "none"})))
     if view.health:
@@ -140,11 +138,12 @@ def states(view: FlightView) -> str:
         ("k-dead", "dead reckoning, rejected, critical"),
         ("k-none", "no position"),
     ]
-    body = strips(bands, end, "States over time")
-    return (
-        '<h2>Sources and states</h2><p class="lead">The source of each position, whether the map match of the '
-        "frame was accepted, how the covariance was computed, and the temperature band.</p>"
-        f'<div class="scroll">{body}</div>{legend(keys)}'
+    return kit.section(
+        "Sources and states",
+        "The source of each position, whether the map match of the frame was accepted, how the covariance was "
+        "computed, and the temperature band.",
+        kit.scroll(strips(bands, end, "States over time")),
+        kit.legend(keys),
     )
 
 
@@ -153,24 +152,14 @@ def verdicts(view: FlightView) -> str:
     if not view.verdicts:
         return ""
     blocks = []
-    for measurement, counts in view.verdicts.items():
-        total = sum(counts.values())
-        rows = []
-        for reason, count in sorted(counts.items(), key=lambda kv: (kv[0] != "accepted", -kv[1])):
-            css = "k-sat" if reason == "accepted" else "k-dead"
-            rows.append(
-                f"<div><span>{escape(reason.replace('_', ' '))}</span>"
-                f'<u class="{css}" style="width:{100 * count / total:.1f}%"></u>'
-                f"<span>{count} · {100 * count / total:.0f} %</span></div>"
-            )
-        blocks.append(f'<div class="verdict"><h3>{escape(measurement)}</h3>{"".join(rows)}</div>')
+    for measurement, found in view.verdicts.items():
+        ranked = sorted(found.items(), key=lambda kv: (kv[0] != "accepted", -kv[1]))
+        rows = [(why.replace("_", " "), n, "k-sat" if why == "accepted" else "k-dead") for why, n in ranked]
+        blocks.append(kit.counts(rows, measurement))
     matched = sum(view.matched_by.values())
-    shares = [f"{escape(by)} {100 * n / matched:.0f} %" for by, n in sorted(view.matched_by.items())]
+    shares = [f"{by} {100 * n / matched:.0f} %" for by, n in sorted(view.matched_by.items())]
     by = f" Frames matched with the map by: {', '.join(shares)}." if shares else ""
-    return (
-        f'<h2>Verdicts</h2><p class="lead">Verdicts per measurement; rejected ones by reason.{by}</p>'
-        f'<div class="two">{"".join(blocks)}</div>'
-    )
+    return kit.section("Verdicts", f"Verdicts per measurement; rejected ones by reason.{by}", kit.two(*blocks))
 
 
 def rejected_map_matches(view: FlightView) -> str:
@@ -179,20 +168,20 @@ def rejected_map_matches(view: FlightView) -> str:
         return ""
     ranked = sorted(view.rejected_maps, key=lambda match: 0.0 if match.test_ratio is None else -match.test_ratio)
     shown = sorted(ranked[:MAX_REJECTED], key=lambda match: match.t_s)
-    head = "".join(f"<th>{name}</th>" for name in ("time", "frame", "verdict", "raised by", "test ratio", "detail"))
-    rows = "".join(_rejected_row(match) for match in shown)
-    return (
-        f'<h2>Rejected map matches</h2><p class="lead">{len(shown)} of {len(view.rejected_maps)} rejected map matches, '
-        "those with the largest test ratios (squared Mahalanobis distance over the limit of the gate).</p>"
-        f'<div class="scroll"><table><tr>{head}</tr>{rows}</table></div>'
+    return kit.section(
+        "Rejected map matches",
+        f"{len(shown)} of {len(view.rejected_maps)} rejected map matches, those with the largest test ratios (squared "
+        "Mahalanobis distance over the limit of the gate).",
+        kit.table(
+            ("time", "frame", "verdict", "raised by", "test ratio", "detail"), map(_rejected_row, shown), css="texts"
+        ),
     )
 
 
-def _rejected_row(match: RejectedMatch) -> str:
+def _rejected_row(match: RejectedMatch) -> tuple[str, ...]:
     ratio = "-" if match.test_ratio is None else f"{match.test_ratio:.2f}"
     raised_by = "anchor" if match.by_anchor else "estimator"
-    cells = (f"{match.t_s:.1f} s", str(match.frame_id), match.verdict.replace("_", " "), raised_by, ratio, match.detail)
-    return "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
+    return f"{match.t_s:.1f} s", str(match.frame_id), match.verdict.replace("_", " "), raised_by, ratio, match.detail
 
 
 def end_s(view: FlightView) -> float:
@@ -203,18 +192,6 @@ def spans(
     samples: list[tuple[float, str]], end: float, prefix: str, labels: dict[str, str]
 ) -> list[tuple[float, float, str, str]]:
     return [
-        (from_s, to_s, f"{prefix}{state or 'none'}", f"{clock(round(max(0.0, from_s)))}  {labels.get(state, state)}")
+        (from_s, to_s, f"{prefix}{state or 'none'}", f"{stamp(from_s)}  {labels.get(state, state)}")
         for from_s, to_s, state in spans_of(samples, end)
     ]
-
-
-def table(rows: list[tuple[str, str]]) -> str:
-    body = "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows)
-    return f"<table>{body}</table>"
-
-
-def legend(keys: list[tuple[str, str]]) -> str:
-    items = "".join(
-        f'<label style="cursor:default"><i class="key {css}"></i>{escape(text)}</label>' for css, text in keys
-    )
-    return f'<div class="legend">{items}</div>'

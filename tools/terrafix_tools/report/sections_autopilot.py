@@ -3,14 +3,14 @@
 import math
 import re
 from collections import Counter
-from html import escape
 from itertools import pairwise
 from typing import Any
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.report.charts import Band, Chart, Point, clock, strips
+from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
+from terrafix_tools.pages.document import kit
 from terrafix_tools.report.data import FlightView
-from terrafix_tools.report.sections import end_s, legend, spans, table
+from terrafix_tools.report.sections import end_s, spans
 from terrafix_tools.report.text import FIX_3D, GAP_S, gps_stats
 
 NUMBER = re.compile(r"\d+(\.\d+)?")  # reasons that differ only in their numbers are counted together
@@ -38,16 +38,16 @@ def link(view: FlightView) -> str:
         states = [(t, "good" if state.connected else "bad") for t, state in view.link_states]
         bands.append(Band("link", spans(states, end, "f-", {"good": "connected", "bad": "not connected"})))
     bands += _flag_bands(view, end)
-    parts = [
-        '<h2>GPS_INPUT and the autopilot</h2><p class="lead">Above what was sent, below what the EKF of the autopilot '
-        "reports of it (its horizontal position and velocity, its attitude, whether any sensor aids it), over the same "
-        f"time. An interval over {1000 * GAP_S:.0f} ms is a gap.</p>",
-        f'<div class="scroll">{strips(bands, end, "Link over time")}',
-    ]
-    if stats is not None:
-        parts += [_accuracies(view, end), _jumps(view, end), _intervals(view, end)]
-    parts += [_ratios(view, end), "</div>", _tables(view), _texts(view)]
-    return "".join(parts)
+    sent = [] if stats is None else [_accuracies(view, end), _jumps(view, end), _intervals(view, end)]
+    return kit.section(
+        "GPS_INPUT and the autopilot",
+        "Above what was sent, below what the EKF of the autopilot reports of it (its horizontal position and velocity, "
+        "its attitude, whether any sensor aids it), over the same time. "
+        f"An interval over {1000 * GAP_S:.0f} ms is a gap.",
+        kit.scroll(strips(bands, end, "Link over time"), *sent, _ratios(view, end)),
+        _tables(view),
+        _texts(view),
+    )
 
 
 def _fixes(view: FlightView) -> list[tuple[float, str]]:
@@ -85,7 +85,7 @@ def _accuracies(view: FlightView, end: float) -> str:
     for css, points in series:
         chart.line(points, css)
     keys = [("k-sat", "horizontal accuracy sent"), ("k-good", "vertical accuracy sent")]
-    return f"<h3>Accuracy sent</h3>{chart.svg('Accuracy sent over time')}{legend(keys)}"
+    return kit.block("Accuracy sent", chart.svg("Accuracy sent over time"), kit.legend(keys))
 
 
 def _jumps(view: FlightView, end: float) -> str:
@@ -104,7 +104,7 @@ def _jumps(view: FlightView, end: float) -> str:
     largest = max((v for _, v in points if v is not None), default=0.0)
     chart = Chart(x_max=end, y_min=0.0, y_max=max(0.5, 1.15 * largest), height=130)
     chart.line(points, "age")
-    return f"<h3>Steps of the position beyond the velocity sent</h3>{chart.svg('Steps of the position sent')}"
+    return kit.block("Steps of the position beyond the velocity sent", chart.svg("Steps of the position sent"))
 
 
 def _intervals(view: FlightView, end: float) -> str:
@@ -114,7 +114,7 @@ def _intervals(view: FlightView, end: float) -> str:
     chart = Chart(x_max=end, y_min=20.0, y_max=max(300.0, top * 1.2), height=150, log_y=True, y_unit="ms")
     chart.level(1000 * GAP_S, f"{1000 * GAP_S:.0f} ms")
     chart.line(steps, "error")
-    return f"<h3>Interval between messages</h3>{chart.svg('Interval of GPS_INPUT')}"
+    return kit.block("Interval between messages", chart.svg("Interval of GPS_INPUT"))
 
 
 def _ratios(view: FlightView, end: float) -> str:
@@ -129,7 +129,7 @@ def _ratios(view: FlightView, end: float) -> str:
     chart.line(velocities, "age")
     chart.line(positions, "error")
     keys = [("k-ink", "position"), ("k-vis", "velocity")]
-    return f"<h3>Test ratios of the EKF</h3>{chart.svg('Test ratios of the EKF over time')}{legend(keys)}"
+    return kit.block("Test ratios of the EKF", chart.svg("Test ratios of the EKF over time"), kit.legend(keys))
 
 
 def _tables(view: FlightView) -> str:
@@ -143,7 +143,7 @@ def _tables(view: FlightView) -> str:
             ("rate", f"{stats.rate_hz:.2f} Hz"),
             ("with a 3D fix", f"{100 * stats.share_3d:.1f} %"),
             ("99 % of intervals below", f"{1000 * stats.interval_p99_s:.0f} ms"),
-            ("longest gap", f"{1000 * stats.longest_s:.0f} ms at {clock(round(max(0.0, stats.longest_at_s)))}"),
+            ("longest gap", f"{1000 * stats.longest_s:.0f} ms at {stamp(stats.longest_at_s)}"),
             ("gaps", str(stats.gaps)),
         ]
         sent += [(f"no 3D fix: {reason}", f"{count}") for reason, count in reasons.most_common(6)]
@@ -159,19 +159,20 @@ def _tables(view: FlightView) -> str:
     peer = [
         (k.replace("_", " "), f"{round(v, 3):g}" if isinstance(v, float) else str(v)) for k, v in _scalars(view.peer)
     ]
-    counted = f"<details><summary>Counted by the autopilot</summary>{table(peer)}</details>" if peer else ""
-    first = f"<div><h3>Sent</h3>{table(sent)}</div>" if sent else ""
-    second = f"<div><h3>Received by the autopilot</h3>{table(used)}{counted}</div>" if used or peer else ""
-    return f'<div class="two" style="margin-top:24px">{first}{second}</div>'
+    counted = kit.folded("Counted by the autopilot", kit.facts(peer)) if peer else ""
+    return kit.two(
+        kit.block("Sent", kit.facts(sent)) if sent else "",
+        kit.block("Received by the autopilot", kit.facts(used), counted) if used or peer else "",
+    )
 
 
 def _texts(view: FlightView) -> str:
     if not view.pilot_texts:
         return ""
-    texts = [(clock(round(max(0.0, t))), text.text) for t, text in view.pilot_texts[:MAX_TEXTS]]
+    texts = [(stamp(t), text.text) for t, text in view.pilot_texts[:MAX_TEXTS]]
     count = len(view.pilot_texts)
     shown = f"{count}" if count <= MAX_TEXTS else f"the first {MAX_TEXTS} of {count}"
-    return f"<details><summary>{escape(f'Texts to the pilot ({shown})')}</summary>{table(texts)}</details>"
+    return kit.folded(f"Texts to the pilot ({shown})", kit.facts(texts))
 
 
 def _scalars(peer: dict[str, Any]) -> list[tuple[str, Any]]:

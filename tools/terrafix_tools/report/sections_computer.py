@@ -2,15 +2,15 @@
 
 from collections import defaultdict
 from collections.abc import Callable
-from html import escape
 
 import numpy as np
 
 from terrafix.health.load import ALL
 from terrafix.messages import ThermalReading
-from terrafix_tools.report.charts import Band, Chart, Point, clock, strips
+from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
+from terrafix_tools.pages.document import kit
 from terrafix_tools.report.data import FlightView
-from terrafix_tools.report.sections import end_s, legend, spans, table
+from terrafix_tools.report.sections import end_s, spans
 from terrafix_tools.report.stage_times import STAGES
 from terrafix_tools.report.text import UNPLANNED
 
@@ -27,7 +27,7 @@ def computer(view: FlightView) -> str:
     parts = [_latency(view), _load(view), _heat(view), _processes(view)]
     if not any(parts):
         return ""
-    return f"<h2>Computer</h2>{''.join(parts)}"
+    return kit.section("Computer", "", *parts)
 
 
 def _latency(view: FlightView) -> str:
@@ -42,8 +42,7 @@ def _latency(view: FlightView) -> str:
         if not delays:
             continue
         step = times.step_ms(stage)
-        cells = [stage, "-" if step is None else f"{step:.0f} ms", *(f"{delay:.0f} ms" for delay in delays)]
-        rows.append("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>")
+        rows.append([stage, None if step is None else f"{step:.0f} ms", *(f"{delay:.0f} ms" for delay in delays)])
         chart_points.append((css, medians(times.series(stage, view.zero_ns), end_s(view))))
     values = [value for _, points in chart_points for _, value in points if value is not None]
     chart = Chart(
@@ -53,13 +52,15 @@ def _latency(view: FlightView) -> str:
     for css, points in chart_points:
         chart.line(points, css)
     keys = [(key, stage) for key, stage in zip(STAGE_KEYS, STAGES, strict=True) if times.delay_ns[stage]]
-    head = "".join(f"<th>{name}</th>" for name in ("stage", "step, median", "median", "95 %", "99 %"))
-    return (
-        '<h3>Latency by stage</h3><p class="quiet">From the exposure of a frame to the reception at the recorder, '
-        'to 10 ms. "Step": since the stage before. "estimate": the last one of a frame; '
-        '"GPS_INPUT": the first one after it.</p>'
-        f'<div class="scroll"><table class="numbers"><tr>{head}</tr>{"".join(rows)}</table>'
-        f"{chart.svg('Latency by stage over time')}</div>{legend(keys)}"
+    return kit.block(
+        "Latency by stage",
+        kit.quiet(
+            'From the exposure of a frame to the reception at the recorder, to 10 ms. "Step": since the stage before. '
+            '"estimate": the last one of a frame; "GPS_INPUT": the first one after it.'
+        ),
+        kit.table(("stage", "step, median", "median", "95 %", "99 %"), rows),
+        kit.scroll(chart.svg("Latency by stage over time")),
+        kit.legend(keys),
     )
 
 
@@ -77,10 +78,8 @@ def _load(view: FlightView) -> str:
     by_process = _lines(view, "By process", "%", 2.0, lambda r: {k: 100 * v for k, v in r.cpu_load.items() if k != ALL})
     if not whole:
         return ""
-    return (
-        '<h3>Processor load</h3><p class="quiet">Of all cores together, other programs included; of one core by '
-        f'process, so that several threads may exceed 100 %.</p><div class="scroll">{whole}{by_process}</div>'
-    )
+    about = "Of all cores together, other programs included; of one core by process, so that several threads may "
+    return kit.block("Processor load", kit.quiet(f"{about}exceed 100 %."), kit.scroll(whole, by_process))
 
 
 def _heat(view: FlightView) -> str:
@@ -88,12 +87,12 @@ def _heat(view: FlightView) -> str:
     if view.thermal and any(reading.zones for _, reading in view.thermal):
         heat = _lines(view, "Temperature", "°C", 3.0, lambda r: {z.name: z.temperature_c for z in r.zones})
     else:
-        heat = _line("Temperature", "°C", 3.0, [(t, health.temperature_c) for t, health in view.health], end)
+        heat = _line("Temperature", "°C", 3.0, [(t, health.temperature_c) for t, health in view.health], view)
     clocks = _lines(
         view, "Clock limit", "%", 5.0, lambda r: {c.name: 100 * c.limit_mhz / c.max_mhz for c in r.clocks if c.max_mhz}
     )
     rails = _lines(view, "Power by rail", "W", 0.5, lambda r: {rail.name: rail.power_w for rail in r.rails})
-    power = rails or _line("Power", "W", 1.0, [(t, health.power_w) for t, health in view.health], end)
+    power = rails or _line("Power", "W", 1.0, [(t, health.power_w) for t, health in view.health], view)
     if not (heat or clocks or power or view.health):
         return ""
     bands = []
@@ -103,9 +102,9 @@ def _heat(view: FlightView) -> str:
         limited = [(t, "hot" if health.throttled else "normal") for t, health in view.health]
         bands.append(Band("throttled", spans(limited, end, "f-", {"hot": "throttled", "normal": "not throttled"})))
     causes = list(dict.fromkeys(health.cause for _, health in view.health if health.cause))
-    said = f'<p class="quiet">{escape("; ".join(causes[:4]))}</p>' if causes else ""
+    said = kit.quiet("; ".join(causes[:4])) if causes else ""
     strip = strips(bands, end, "Thermal band over time") if bands else ""
-    return f'<h3>Heat and power</h3>{said}<div class="scroll">{strip}{heat}{clocks}{power}</div>'
+    return kit.block("Heat and power", said, kit.scroll(strip, heat, clocks, power))
 
 
 def _lines(
@@ -118,20 +117,22 @@ def _lines(
     largest = sorted(series, key=lambda key: -max(v for _, v in series[key] if v is not None))[:MAX_SERIES]
     if not largest:
         return ""
-    values = [v for key in largest for _, v in series[key] if v is not None]
-    chart = Chart(x_max=end_s(view), y_min=min(values) - margin, y_max=max(values) + margin, height=150, y_unit=unit)
-    for key, css in zip(largest, LINES, strict=False):
-        chart.line(series[key], css)
-    return f"<h4>{name}</h4>{chart.svg(name)}{legend(list(zip(KEYS, largest, strict=False)))}"
+    chart = _chart(name, unit, margin, [(series[key], css) for key, css in zip(largest, LINES, strict=False)], view)
+    return chart + kit.legend(zip(KEYS, largest, strict=False))
 
 
-def _line(name: str, unit: str, margin: float, points: list[Point], end: float) -> str:
-    values = [v for _, v in points if v is not None]
+def _line(name: str, unit: str, margin: float, points: list[Point], view: FlightView) -> str:
+    return _chart(name, unit, margin, [(points, name.lower())], view)
+
+
+def _chart(name: str, unit: str, margin: float, series: list[tuple[list[Point], str]], view: FlightView) -> str:
+    values = [v for points, _ in series for _, v in points if v is not None]
     if not values:
         return ""
-    chart = Chart(x_max=end, y_min=min(values) - margin, y_max=max(values) + margin, height=140, y_unit=unit)
-    chart.line(points, name.lower())
-    return f"<h4>{name}</h4>{chart.svg(name)}"
+    chart = Chart(x_max=end_s(view), y_min=min(values) - margin, y_max=max(values) + margin, height=150, y_unit=unit)
+    for points, css in series:
+        chart.line(points, css)
+    return kit.chart(name, chart.svg(name))
 
 
 def _processes(view: FlightView) -> str:
@@ -142,16 +143,18 @@ def _processes(view: FlightView) -> str:
     by_process: defaultdict[str, list[tuple[float, float, str, str]]] = defaultdict(list)
     for t_s, event in view.events:
         css = "f-bad" if event.event in UNPLANNED else "f-good"
-        text = f"{clock(round(max(0, t_s)))}  {event.process} {event.event.replace('_', ' ')} {event.detail}".strip()
+        text = f"{stamp(t_s)}  {event.process} {event.event.replace('_', ' ')} {event.detail}".strip()
         by_process[event.process].append((t_s, t_s + end * EVENT_WIDTH, css, text))
     for t_s, loss in view.losses:
-        text = f"{clock(round(max(0, t_s)))}  {loss.process} lost {loss.count} {loss.message}"
+        text = f"{stamp(t_s)}  {loss.process} lost {loss.count} {loss.message}"
         by_process[loss.process].append((t_s, t_s + end * EVENT_WIDTH, "f-hot", text))
     bands = [Band(name, sorted(found)) for name, found in by_process.items()]
     keys = [("k-good", "started, stopped"), ("k-dead", "died, stuck, given up")]
     keys += [("k-vis", "messages lost")] if view.losses else []
     lost = [(name, str(count)) for name, count in view.dropped.most_common(8)]
-    return (
-        f'<h3>Processes</h3><div class="scroll">{strips(bands, end, "Processes over time")}</div>{legend(keys)}'
-        f"{f'<details><summary>Messages lost</summary>{table(lost)}</details>' if lost else ''}"
+    return kit.block(
+        "Processes",
+        kit.scroll(strips(bands, end, "Processes over time")),
+        kit.legend(keys),
+        kit.folded("Messages lost", kit.facts(lost)) if lost else "",
     )

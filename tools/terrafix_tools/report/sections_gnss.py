@@ -4,9 +4,10 @@ from collections import defaultdict
 
 from terrafix.link.gnss.spoofing_detector import AGREEMENT_SIGMAS
 from terrafix.messages import GnssReading, GnssVerdict
-from terrafix_tools.report.charts import Band, Chart, Point, clock, strips
+from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
+from terrafix_tools.pages.document import kit
 from terrafix_tools.report.data import FlightView
-from terrafix_tools.report.sections import end_s, legend, spans, table
+from terrafix_tools.report.sections import end_s, spans
 
 LINES = ("error", "claim", "age", "refined")  # of the first receivers
 KEYS = ("k-ink", "k-sat", "k-vis", "k-good")
@@ -38,22 +39,20 @@ def gnss(view: FlightView) -> str:
         ("k-soft", "lost"),
         ("k-none", "unknown"),
     ]
-    return (
-        '<h2>GNSS receivers</h2><p class="lead">What the judge says of each receiver of the autopilot, and how far its '
-        "position is from the estimate. No receiver is fused in flight.</p>"
-        f'<div class="scroll">{strips(bands, end, "State of the receivers over time")}{legend(keys)}'
-        f"{_distances(states, end)}{_sigmas(states, end)}</div>{_changes(states)}"
+    distances = {receiver: [(t, v.distance_m) for t, v in found] for receiver, found in states.items()}
+    sigmas = {receiver: [(t, v.sigmas) for t, v in found] for receiver, found in states.items()}
+    return kit.section(
+        "GNSS receivers",
+        "What the judge says of each receiver of the autopilot, and how far its position is from the estimate. No "
+        "receiver is fused in flight.",
+        kit.scroll(
+            strips(bands, end, "State of the receivers over time"),
+            kit.legend(keys),
+            _chart("Distance from the estimate", "m", distances, end, None),
+            _chart("The same in standard deviations of both", "", sigmas, end, AGREEMENT_SIGMAS),
+        ),
+        _changes(states),
     )
-
-
-def _distances(states: dict[int, list[tuple[float, GnssVerdict]]], end: float) -> str:
-    series = {receiver: [(t, v.distance_m) for t, v in found] for receiver, found in states.items()}
-    return _chart("Distance from the estimate", "m", series, end, None)
-
-
-def _sigmas(states: dict[int, list[tuple[float, GnssVerdict]]], end: float) -> str:
-    series = {receiver: [(t, v.sigmas) for t, v in found] for receiver, found in states.items()}
-    return _chart("The same in standard deviations of both", "", series, end, AGREEMENT_SIGMAS)
 
 
 def _chart(name: str, unit: str, series: dict[int, list[Point]], end: float, level: float | None) -> str:
@@ -66,7 +65,7 @@ def _chart(name: str, unit: str, series: dict[int, list[Point]], end: float, lev
     for i, (_, points) in enumerate(sorted(series.items())):
         chart.line(points, LINES[i % len(LINES)])
     keys = [(KEYS[i % len(KEYS)], f"GPS{receiver + 1}") for i, receiver in enumerate(sorted(series))]
-    return f"<h3>{name}</h3>{chart.svg(name)}{legend(keys) if len(keys) > 1 else ''}"
+    return kit.block(name, chart.svg(name), kit.legend(keys) if len(keys) > 1 else "")
 
 
 def _changes(states: dict[int, list[tuple[float, GnssVerdict]]]) -> str:
@@ -76,9 +75,8 @@ def _changes(states: dict[int, list[tuple[float, GnssVerdict]]]) -> str:
         for t_s, verdict in found:
             if verdict.state is not last:
                 text = f"{verdict.state}: {verdict.reason}".rstrip(": ")
-                rows.append((t_s, f"{clock(round(max(0.0, t_s)))}  GPS{receiver + 1}", text))
+                rows.append((t_s, f"{stamp(t_s)}  GPS{receiver + 1}", text))
             last = verdict.state
     rows.sort()
-    shown = table([(name, text) for _, name, text in rows[:MAX_CHANGES]])
     count = f"{len(rows)}" if len(rows) <= MAX_CHANGES else f"the first {MAX_CHANGES} of {len(rows)}"
-    return f"<details><summary>Changes of state ({count})</summary>{shown}</details>"
+    return kit.folded(f"Changes of state ({count})", kit.facts(row[1:] for row in rows[:MAX_CHANGES]))

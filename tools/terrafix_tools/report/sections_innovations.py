@@ -2,16 +2,17 @@
 
 import math
 from collections import Counter
-from html import escape
 
 import numpy as np
 
 from terrafix_tools.estimates import NS
-from terrafix_tools.report.charts import HALF_WIDTH, Chart, Point
+from terrafix_tools.pages.charts import HALF_WIDTH, Chart, Point
+from terrafix_tools.pages.document import kit, macros
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.innovations import NORMAL_OUTSIDE, Innovations, spread_of
-from terrafix_tools.report.sections import end_s, legend
+from terrafix_tools.report.sections import end_s
 
+OWN = macros("terrafix_tools/report.html")
 FLOOR, MIN_TOP = 1e-3, 3.0  # of the axis of test ratios
 SIGMAS, BINS = 4.0, 32  # of the histogram; what is outside counts in the last bin
 MIN_HISTOGRAM = 8  # innovations; fewer have no distribution to look at
@@ -22,25 +23,22 @@ def innovations(view: FlightView) -> str:
     found = {name: one for name, one in view.innovations.items() if one.tested}
     if not found:
         return ""
-    blocks = "".join(_block(view, name, one) for name, one in found.items())
     keys = [("k-sat dot", "accepted"), ("k-dead dot", "rejected"), ("k-ink", "N(0, 1)")]
-    return (
-        '<h2>Innovations and gates</h2><p class="lead">Left: test ratio of each measurement over time; above 1 it is '
-        "beyond its gate. Right: accepted innovations over their stated 1-sigma, all components. They should have the "
-        "distribution N(0, 1): wider means that stated sigmas are too small.</p>"
-        f"{blocks}{legend(keys)}"
+    return kit.section(
+        "Innovations and gates",
+        "Left: test ratio of each measurement over time; above 1 it is beyond its gate. Right: accepted innovations "
+        "over their stated 1-sigma, all components. They should have the distribution N(0, 1): wider means that stated "
+        "sigmas are too small.",
+        *(_block(view, name, one) for name, one in found.items()),
+        kit.legend(keys),
     )
 
 
 def _block(view: FlightView, name: str, one: Innovations) -> str:
     values = one.normalised()
     histogram = _histogram(name, values.ravel()) if values.size >= MIN_HISTOGRAM else ""
-    return (
-        f'<div class="innovation"><h3>{escape(name.replace("_", " "))} '
-        f"<span>{escape(_rejected(view, name))}</span></h3>"
-        f'<div class="two"><div>{_ratios(view, name, one)}</div>'
-        f'<div>{histogram}<p class="quiet">{escape(_words(values))}</p></div></div></div>'
-    )
+    rejected, ratios = _rejected(view, name), _ratios(view, name, one)
+    return OWN.innovation(name.replace("_", " "), rejected, ratios, histogram, _words(values))
 
 
 def _ratios(view: FlightView, name: str, one: Innovations) -> str:

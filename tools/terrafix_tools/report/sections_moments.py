@@ -1,20 +1,20 @@
 """The section of the worst moments: a list with links, then each with frame, map, matches and reasons."""
 
 import shlex
-from html import escape
 from pathlib import Path
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix_tools.report.charts import clock
+from terrafix_tools.pages.charts import stamp
+from terrafix_tools.pages.document import kit, macros
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.map_crop import open_map
 from terrafix_tools.report.moment_picture import Pictures, pictures
 from terrafix_tools.report.moment_record import FrameRecord, read_frames, shown_frame
-from terrafix_tools.report.moment_text import facts
+from terrafix_tools.report.moment_text import facts as words_of
 from terrafix_tools.report.moments import Moment
-from terrafix_tools.report.sections import table
 from terrafix_tools.report.sections_run import picture_rows
 
+OWN = macros("terrafix_tools/report.html")
 AROUND_S = 1.0  # `terrafix log show` of a moment: this much before and after it
 RULE = (
     "Chosen by what the record says, in turns: longest loss of the fix, faults, links and processes lost, largest "
@@ -31,16 +31,9 @@ def moments_sections(view: FlightView, moments: list[Moment], map_path: Path | N
     if not moments:
         return "", ""
     blocks = _blocks(view, moments, [frames[frame_id] for frame_id in shown], frames, map_path)
-    items = "".join(
-        f'<li><a href="#moment-{i}"><b>{i}</b></a><time>{_time(moment)}</time>'
-        f'<a href="#moment-{i}">{escape(_headline(moment))}</a></li>'
-        for i, moment in enumerate(moments, 1)
-    )
+    listed = [(stamp(moment.t_s), _headline(moment)) for moment in moments]
     name = "moment" if len(moments) == 1 else f"{len(moments)} moments"
-    return (
-        f'<h2 id="worst">The worst {name}</h2><p class="lead">{RULE}</p><ol class="worst">{items}</ol>',
-        f"<h2>The worst {name} in detail</h2>{''.join(blocks)}",
-    )
+    return OWN.worst(f"The worst {name}", RULE, listed), kit.section(f"The worst {name} in detail", "", *blocks)
 
 
 def _blocks(
@@ -78,21 +71,22 @@ def _block(
     view: FlightView, number: int, moment: Moment, shown: FrameRecord, own: FrameRecord, drawn: Pictures | None
 ) -> str:
     row = view.rows[moment.row]
-    reasons = "".join(f"<li>{escape(text)}</li>" for text in list(moment.reasons.values())[1:])
-    frame = f"frame {moment.frame_id}" + (f" · {row.file}" if row.file else "")
-    return (
-        f'<article class="moment" id="moment-{number}">'
-        f'<h3><a href="#worst">{number}</a> {escape(_headline(moment))}</h3>'
-        f'<p class="quiet">{_time(moment)} · {escape(frame)} · '
-        f'<a href="#map" data-i="{moment.row}">on the map</a></p>'
-        f"{f'<ul>{reasons}</ul>' if reasons else ''}{_pair(view, shown, drawn)}"
-        f"{table(facts(view, moment, own, shown))}<pre>{escape(_commands(view, moment))}</pre></article>"
+    return OWN.moment(
+        number=number,
+        headline=_headline(moment),
+        time=stamp(moment.t_s),
+        frame=f"frame {moment.frame_id}" + (f" · {row.file}" if row.file else ""),
+        row=moment.row,
+        reasons=list(moment.reasons.values())[1:],
+        pictures=_pair(view, shown, drawn) if drawn is not None else [],
+        ratio=drawn.ratio if drawn is not None else 1.0,
+        facts=kit.facts(words_of(view, moment, own, shown)),
+        commands=_commands(view, moment),
     )
 
 
-def _pair(view: FlightView, shown: FrameRecord, drawn: Pictures | None) -> str:
-    if drawn is None:
-        return '<p class="quiet">No picture: the record has not this frame or no Origin.</p>'
+def _pair(view: FlightView, shown: FrameRecord, drawn: Pictures) -> list[tuple[str, str]]:
+    """Frame and map: SVG, caption."""
     notes = [f"Frame {shown.frame_id}"]
     if shown.frame_id not in view.thumbnails:
         notes.append("no readable picture of it in the record")
@@ -107,13 +101,7 @@ def _pair(view: FlightView, shown: FrameRecord, drawn: Pictures | None) -> str:
     ground.append("solid: the frame where the estimate puts it, with its 95 % ellipse")
     if drawn.shows_rejected:
         ground.append("dashed: where the map match that was not used puts it")
-    figures = [
-        f"<figure>{svg}<figcaption>{escape('; '.join(words))}.</figcaption></figure>"
-        for svg, words in ((drawn.frame, notes), (drawn.ground, ground))
-        if svg
-    ]
-    share = f' style="grid-template-columns:1fr {drawn.ratio:.3f}fr"' if len(figures) == 2 else ""
-    return f'<div class="pair"{share}>{"".join(figures)}</div>'
+    return [(svg, "; ".join(words)) for svg, words in ((drawn.frame, notes), (drawn.ground, ground)) if svg]
 
 
 def _commands(view: FlightView, moment: Moment) -> str:
@@ -128,7 +116,3 @@ def _commands(view: FlightView, moment: Moment) -> str:
 
 def _headline(moment: Moment) -> str:
     return next(iter(moment.reasons.values()))
-
-
-def _time(moment: Moment) -> str:
-    return clock(round(max(0.0, moment.t_s)))

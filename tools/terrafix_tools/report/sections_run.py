@@ -1,17 +1,18 @@
 """Lower sections of the report: time per frame, images, provenance."""
 
-import base64
 import json
-from html import escape
 
 import numpy as np
 
 from terrafix_tools.before_after import HEADER, Change, kept_line
-from terrafix_tools.report import document
-from terrafix_tools.report.charts import HALF_WIDTH, Chart, clock
+from terrafix_tools.pages.charts import HALF_WIDTH, Chart, clock
+from terrafix_tools.pages.document import kit, macros
+from terrafix_tools.pages.pictures import data_uri
 from terrafix_tools.report.data import FlightView, radius95_m
-from terrafix_tools.report.sections import LABELS, table
+from terrafix_tools.report.sections import LABELS
 
+OWN = macros("terrafix_tools/report.html")
+IMAGE_KEYS = {"satellite_anchored": "k-sat", "visual_propagated": "k-vis", "dead_reckoned": "k-dead"}
 MAX_IMAGES = 8
 BINS = 40
 
@@ -20,8 +21,8 @@ def finalised(view: FlightView) -> str:
     """What the smoother after landing has changed; empty where it did not run."""
     changes = [row for flight in view.finalised_flights for row in flight.get("before_after", [])]
     rows: list[list[object]] = [[*Change(**row).cells()] for row in changes]
-    lines = "".join(f"<p>{escape(line)}</p>" for line in map(kept_line, view.finalised_flights) if line)
-    return f"<h2>Finalised after landing</h2>{lines}{document.table([*HEADER], rows)}" if rows else ""
+    lines = [kit.line(line) for line in map(kept_line, view.finalised_flights) if line]
+    return kit.section("Finalised after landing", "", *lines, kit.table(HEADER, rows)) if rows else ""
 
 
 def timing(view: FlightView) -> str:
@@ -56,10 +57,7 @@ def timing(view: FlightView) -> str:
         rows.append(("peak memory", f"{view.summary['peak_memory_mb']:.0f} MB"))
     if "wall_s" in view.summary:
         rows.append(("whole replay", clock(round(view.summary["wall_s"]))))
-    return (
-        f'<h2>Time per frame</h2><p class="lead">{timing_scope}</p><div class="two">'
-        f"<div>{chart.svg('Histogram of times')}</div><div>{table(rows)}</div></div>"
-    )
+    return kit.section("Time per frame", timing_scope, kit.two(chart.svg("Histogram of times"), kit.facts(rows)))
 
 
 def picture_rows(view: FlightView) -> list[int]:
@@ -90,25 +88,19 @@ def camera_images(view: FlightView) -> str:
     parts = []
     for i in sorted(chosen):
         row = view.rows[i]
-        data = base64.b64encode(view.thumbnails[view.frame_ids[i]]).decode()
+        data = data_uri("image/jpeg", view.thumbnails[view.frame_ids[i]])
         error, radius = view.error_m(row), radius95_m(row)
-        facts = [
+        facts = (
             f"{error:.1f} m error" if error is not None else "",
             f"95 % radius {radius:.1f} m" if radius is not None else "",
             f"{row.agl_m:.0f} m high" if error is None and row.agl_m is not None else "",
-        ]
-        colour = {"satellite_anchored": "sat", "visual_propagated": "vis", "dead_reckoned": "dead"}.get(
-            row.source_label, "none"
         )
+        about = ", ".join(fact for fact in facts if fact)
+        source = LABELS.get(row.source_label, "") + (" (largest error)" if i == worst else "")
         parts.append(
-            f'<figure data-i="{i}"><img alt="{escape(row.file)}" loading="lazy" src="data:image/jpeg;base64,{data}">'
-            f'<figcaption><i class="k-{colour}"></i><b>{clock(round(row.t_s))}</b> {LABELS.get(row.source_label, "")}'
-            f"{' (largest error)' if i == worst else ''}<br>{', '.join(f for f in facts if f)}</figcaption></figure>"
+            (i, row.file, data, IMAGE_KEYS.get(row.source_label, "k-none"), clock(round(row.t_s)), source, about)
         )
-    return (
-        '<h2>Camera images</h2><p class="lead">Select an image to see its position on the map.</p>'
-        f'<div class="strip">{"".join(parts)}</div>'
-    )
+    return kit.section("Camera images", "Select an image to see its position on the map.", OWN.images(parts))
 
 
 def provenance(view: FlightView) -> str:
@@ -119,7 +111,5 @@ def provenance(view: FlightView) -> str:
     rows += [(f"map {key}", str(chart[key])) for key in ("path", "date", "gsd_m", "checksum") if chart.get(key)]
     rows += [(f"source, {topic}", text) for topic, text in view.header.get("source", [])]
     config = json.dumps(view.header.get("config", view.summary.get("config", {})), indent=2)
-    return (
-        f"<h2>Provenance</h2><details><summary>Versions, map, source and configuration</summary>{table(rows)}"
-        f"<pre>{escape(config)}</pre></details>"
-    )
+    about = kit.folded("Versions, map, source and configuration", kit.facts(rows), kit.pre(config))
+    return kit.section("Provenance", "", about)

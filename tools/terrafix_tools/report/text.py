@@ -8,20 +8,12 @@ import numpy as np
 from terrafix.link.pilot_text.statustext import fault_text
 from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.lens_report import lens_words
-from terrafix_tools.report.charts import clock
+from terrafix_tools.pages.document import Figure
 from terrafix_tools.report.data import FlightView, radius95_m
 
 GAP_S = 0.245  # AC-14: an autopilot may notice a longer interval
 FIX_3D = 3
 UNPLANNED = ("died", "stuck", "gave_up")
-
-
-@dataclass(frozen=True)
-class Figure:
-    value: str
-    unit: str
-    name: str
-    mood: str = ""  # "good", "fair", "bad"; empty: not rated
 
 
 @dataclass(frozen=True)
@@ -165,7 +157,3 @@ def _gps(view: FlightView) -> list[tuple[float | None, str]]:
         text = f"GPS_INPUT is corrected for the map offset estimated from a trusted receiver, by {max_m:.1f} m at most."
         entries.append((corrected[0][0], text + " Estimates are not corrected."))
     return entries
-
-
-def stamp(t_s: float | None) -> str:
-    return "" if t_s is None else clock(round(max(0.0, t_s)))

@@ -1,4 +1,4 @@
-"""The database file: opened, migrated, and its transactions."""
+"""The database file: opened, made, and its transactions."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
 
 from terrafix.core.errors import OutputError
+from terrafix_tools.console.store import schema
 
 FILE = "console.sqlite"
 BUSY_MS = 10_000  # time-out of a write that waits for that of another process
-MIGRATIONS = Path(__file__).parent / "migrations"
 
 
 class Database:
@@ -51,8 +49,8 @@ class Database:
 
 
 def open_database(folder: Path, *, durable: bool = True) -> Database:
-    """Opens ``folder``/FILE and migrates it to the newest schema. ``durable``: a commit waits for the disk; else it
-    survives the end of the process, but maybe not a loss of power. Raises OutputError."""
+    """Opens ``folder``/FILE and makes its tables where it has none. ``durable``: a commit waits for the disk; else it
+    survives the end of the process, but maybe not a loss of power. Raises OutputError, also for a later version."""
     file = folder / FILE
     engine = sa.create_engine(f"sqlite:///{file}", connect_args={"check_same_thread": False, "timeout": BUSY_MS / 1e3})
 
@@ -69,13 +67,21 @@ def open_database(folder: Path, *, durable: bool = True) -> Database:
     sa.event.listen(engine, "connect", settings)
     try:
         with engine.connect() as connection:
-            config = Config()
-            config.set_main_option("script_location", str(MIGRATIONS))
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+            version = connection.exec_driver_sql("PRAGMA user_version").scalar()
+            if version == 0:
+                connection.exec_driver_sql("BEGIN IMMEDIATE")  # another process may open it now
+                schema.metadata.create_all(connection)  # tables that are there already stay as they are
+                connection.exec_driver_sql(f"PRAGMA user_version = {schema.VERSION}")
+                connection.exec_driver_sql("COMMIT")
     except (sa.exc.DatabaseError, sqlite3.DatabaseError) as error:
         engine.dispose()
         raise OutputError(f"{file}: cannot be opened ({error.args[0]}); name another folder with --data") from None
+    if version not in (0, schema.VERSION):
+        engine.dispose()
+        raise OutputError(
+            f"{file}: has tables of version {version}, this Terrafix knows {schema.VERSION}; "
+            "update Terrafix, or name another folder with --data"
+        )
     return Database(engine)
 
 

@@ -1,28 +1,30 @@
-"""The tables of the newest schema; ``migrations`` makes them. Times are nanoseconds, texts in JSON are noted so."""
+"""The tables, which ``database.open_database`` makes. Times are nanoseconds, texts in JSON are noted so."""
 
 import sqlalchemy as sa
+
+VERSION = 1  # of these tables, in user_version of the file
 
 metadata = sa.MetaData()
 
 
 def _of_flight() -> "sa.Column[str]":
-    return sa.Column("flight_id", sa.Text, primary_key=True)
+    return sa.Column("flight_id", sa.Text, sa.ForeignKey("flights.id", ondelete="CASCADE"), primary_key=True)
 
 
 flights = sa.Table(
     "flights",
     metadata,
     sa.Column("id", sa.Text, primary_key=True),
-    sa.Column("name", sa.Text),
-    sa.Column("kind", sa.Text),  # FlightKind
-    sa.Column("state", sa.Text),  # FlightState
-    sa.Column("created_at", sa.Text),
-    sa.Column("spec", sa.Text),  # JSON: NewFlight
-    sa.Column("map_name", sa.Text),
-    sa.Column("map_state", sa.Text),  # MapState
-    sa.Column("map_detail", sa.Text),
-    sa.Column("completing", sa.Boolean),
-    sa.Column("error", sa.Text),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("kind", sa.Text, nullable=False),  # FlightKind
+    sa.Column("state", sa.Text, nullable=False),  # FlightState
+    sa.Column("created_at", sa.Text, nullable=False),
+    sa.Column("spec", sa.Text, nullable=False),  # JSON: NewFlight
+    sa.Column("map_name", sa.Text, nullable=False),
+    sa.Column("map_state", sa.Text, nullable=False),  # MapState
+    sa.Column("map_detail", sa.Text, nullable=False),
+    sa.Column("completing", sa.Boolean, nullable=False),
+    sa.Column("error", sa.Text, nullable=False),
     sa.Column("request", sa.Text),  # JSON: InputRequest that is open
     sa.Column("last_number", sa.Integer),  # in the name of the newest image
 )
@@ -31,20 +33,21 @@ images = sa.Table(
     metadata,
     _of_flight(),
     sa.Column("frame_id", sa.Integer, primary_key=True),
-    sa.Column("name", sa.Text),
-    sa.Column("stored", sa.Text),  # file in the folder of the flight
-    sa.Column("bytes", sa.Integer),
-    sa.Column("sha256", sa.Text),
-    sa.Column("t_ns", sa.Integer),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("stored", sa.Text, nullable=False),  # file in the folder of the flight
+    sa.Column("bytes", sa.Integer, nullable=False),
+    sa.Column("sha256", sa.Text, nullable=False),
+    sa.Column("t_ns", sa.Integer, nullable=False),
     sa.Column("state", sa.Text),  # JSON: VehicleState of the image; None: it states nothing
-    sa.Column("attempts", sa.Integer),  # processes that have died at this image
+    sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),  # processes that have died at this image
+    sa.UniqueConstraint("flight_id", "name"),
 )
 results = sa.Table(
     "results",
     metadata,
     _of_flight(),
     sa.Column("frame_id", sa.Integer, primary_key=True),
-    sa.Column("immediate", sa.Text),  # JSON: FrameResult
+    sa.Column("immediate", sa.Text, nullable=False),  # JSON: FrameResult
     sa.Column("refined", sa.Text),  # JSON: FrameRefined, the newest
 )
 headings = sa.Table(
@@ -52,18 +55,18 @@ headings = sa.Table(
     metadata,
     _of_flight(),
     sa.Column("frame_id", sa.Integer, primary_key=True),
-    sa.Column("heading_deg", sa.Float),
-    sa.Column("sigma_deg", sa.Float),
+    sa.Column("heading_deg", sa.Float, nullable=False),
+    sa.Column("sigma_deg", sa.Float, nullable=False),
 )
 fragments = sa.Table(
     "fragments",
     metadata,
     _of_flight(),
     sa.Column("fragment_id", sa.Integer, primary_key=True),
-    sa.Column("first_frame", sa.Integer),
-    sa.Column("last_frame", sa.Integer),
-    sa.Column("frames", sa.Integer),
-    sa.Column("joined", sa.Boolean),
+    sa.Column("first_frame", sa.Integer, nullable=False),
+    sa.Column("last_frame", sa.Integer, nullable=False),
+    sa.Column("frames", sa.Integer, nullable=False),
+    sa.Column("joined", sa.Boolean, nullable=False),
     sa.Column("merged_at_frame", sa.Integer),
 )
 hints = sa.Table(
@@ -71,7 +74,7 @@ hints = sa.Table(
     metadata,
     _of_flight(),
     sa.Column("hint_id", sa.Integer, primary_key=True),
-    sa.Column("given", sa.Text),  # JSON: Hint or UserFix
+    sa.Column("given", sa.Text, nullable=False),  # JSON: Hint or UserFix
     sa.Column("before_frame", sa.Integer),  # before which it was applied, in this run and in every later one
 )
 events = sa.Table(
@@ -79,7 +82,8 @@ events = sa.Table(
     metadata,
     _of_flight(),
     sa.Column("event_id", sa.Integer, primary_key=True),
-    sa.Column("key", sa.Text),  # what happened; a computation that is repeated finds its event there
-    sa.Column("name", sa.Text),
-    sa.Column("data", sa.Text),  # JSON
+    sa.Column("key", sa.Text, nullable=False),  # what happened; a computation that is repeated finds its event there
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("data", sa.Text, nullable=False),  # JSON
+    sa.UniqueConstraint("flight_id", "key"),
 )

@@ -33,7 +33,8 @@ from terrafix_tools.mapping.vectors.overpass import PUBLIC, fetch_overpass, over
 from terrafix_tools.mapping.vectors.pbf import pbf_features
 from terrafix_tools.mapping.vectors.tags import LICENCE as OSM_LICENCE
 from terrafix_tools.mapping.workers import MAP_BUILD
-from terrafix_tools.parallel.pool import connect, default_workers
+from terrafix_tools.parallel.pool import default_workers
+from terrafix_tools.parallel.scheduler import connect
 
 OVERPASS = "overpass"
 OFFERED_CORRIDOR_KM = 2.0

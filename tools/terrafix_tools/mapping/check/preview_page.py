@@ -1,21 +1,21 @@
 """A self-contained HTML page about a map package: the image, its matchability, and the mission."""
 
-import base64
-import html
-import importlib.resources
 from pathlib import Path
 
 import cv2
 import numpy as np
+from markupsafe import Markup
 
 from terrafix.core.errors import OutputError
 from terrafix_tools.mapping.check.sight import Sight
 from terrafix_tools.mapping.check.suitability import CheckResult, MapCheck
 from terrafix_tools.mapping.check.text import lines_of
+from terrafix_tools.pages.document import kit, macros
+from terrafix_tools.pages.pictures import VOID_BGR, data_uri, jpeg_uri
 
+OWN = macros("terrafix_tools/package.html")
 PICTURE_PX = 1400  # longer side of the inlined image
 JPEG_QUALITY = 82
-VOID_BGR = (226, 230, 230)  # outside of the map
 # BGRA; blue, orange and crimson are distinguishable for the colour-blind, and blind is also the darkest.
 COLOURS = {
     Sight.NO_MAP: (0, 0, 0, 0),
@@ -40,16 +40,9 @@ def write_page(checked: CheckResult, out: Path) -> None:
 
 def page(checked: CheckResult) -> str:
     report = checked.report
-    css = importlib.resources.files("terrafix_tools").joinpath("assets/map.css").read_text(encoding="utf-8")
-    name = html.escape(Path(report.package).name)
-    rows = "".join(f"<dt>{html.escape(what)}</dt><dd>{html.escape(text)}</dd>" for what, text in lines_of(report))
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>{name}</title><style>{css}</style><main><header><p>Map package</p><h1>{name}</h1>"
-        f"<p>{_headline(report)}</p></header>"
-        f'<input type="checkbox" id="sight" checked><label for="sight">Where the camera will see</label>'
-        f"{_svg(checked)}{_legend()}<dl>{rows}</dl></main></html>\n"
-    )
+    name = Path(report.package).name
+    head = kit.header("Map package", name, _headline(report))
+    return kit.document(name, "", head, OWN.sight(_svg(checked), _colours()), kit.facts(lines_of(report)))
 
 
 def _headline(report: MapCheck) -> str:
@@ -69,9 +62,9 @@ def _svg(checked: CheckResult) -> str:
     width, height = max(1, round((e_max - e_min) / gsd_m)), max(1, round((n_max - n_min) / gsd_m))
     image, valid = checked.local.window(e_min, n_max, width, height, gsd_m, checked.report.layer)
     image[~valid] = VOID_BGR
-    ground = _data_uri("image/jpeg", cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+    ground = jpeg_uri(image, JPEG_QUALITY)
     table = np.array([COLOURS[Sight(k)] for k in range(len(Sight))], np.uint8)
-    overlay = _data_uri("image/png", cv2.imencode(".png", table[checked.grid.sight])[1])
+    overlay = data_uri("image/png", cv2.imencode(".png", table[checked.grid.sight])[1].tobytes())
     cells_h, cells_w = checked.grid.sight.shape
     side = checked.grid.step_m / gsd_m
     body = [
@@ -80,7 +73,10 @@ def _svg(checked: CheckResult) -> str:
         f'preserveAspectRatio="none" href="{overlay}"/>',
         _mission(checked, e_min, n_max, gsd_m),
     ]
-    return f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="The map, north up">{"".join(body)}</svg>'
+    size = f"0 0 {width} {height}"
+    return Markup(
+        f'<svg class="package" viewBox="{size}" role="img" aria-label="The map, north up">{"".join(body)}</svg>'
+    )
 
 
 def _mission(checked: CheckResult, e_min_m: float, n_max_m: float, gsd_m: float) -> str:
@@ -95,14 +91,10 @@ def _mission(checked: CheckResult, e_min_m: float, n_max_m: float, gsd_m: float)
     )
 
 
-def _legend() -> str:
-    items = []
+def _colours() -> list[tuple[str, str]]:
+    """CSS colour and meaning of each kind of ground."""
+    found = []
     for sight, words in WORDS.items():
         blue, green, red, alpha = COLOURS[sight]
-        items.append(f'<li><i style="background:rgba({red},{green},{blue},{alpha / 255:.2f})"></i>{words}</li>')
-    items.append("<li><i></i>no colour: less than a whole frame of map</li>")
-    return f'<ul class="legend">{"".join(items)}</ul>'
-
-
-def _data_uri(kind: str, data: np.ndarray) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+        found.append((f"rgba({red},{green},{blue},{alpha / 255:.2f})", words))
+    return found

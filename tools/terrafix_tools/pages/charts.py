@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 
-from terrafix_tools.report.series import Span, thin_line, thin_marks, thin_spans
+from markupsafe import Markup
+
+from terrafix_tools.pages.series import Span, thin_line, thin_marks, thin_spans
 
 WIDTH = 1000  # of a chart across the whole page, in SVG units
 HALF_WIDTH = 540  # of a chart in a column, SVG units
@@ -39,22 +41,10 @@ class Chart:
     marks: list[str] = field(default_factory=list)
 
     def x(self, value: float) -> float:
-        span = self.width - self.gutter - RIGHT
-        if self.log_x:
-            low, high = math.log10(self.x_min), math.log10(self.x_max)
-            share = (math.log10(max(value, self.x_min)) - low) / (high - low)
-        else:
-            share = (value - self.x_min) / max(self.x_max - self.x_min, 1e-9)
-        return self.gutter + span * min(1.0, max(0.0, share))
+        return self.gutter + (self.width - self.gutter - RIGHT) * _share(value, self.x_min, self.x_max, self.log_x)
 
     def y(self, value: float) -> float:
-        span = self.height - TOP - AXIS
-        if self.log_y:
-            low, high = math.log10(self.y_min), math.log10(self.y_max)
-            share = (math.log10(max(value, self.y_min)) - low) / (high - low)
-        else:
-            share = (value - self.y_min) / max(self.y_max - self.y_min, 1e-9)
-        return self.height - AXIS - span * min(1.0, max(0.0, share))
+        return self.height - AXIS - (self.height - TOP - AXIS) * _share(value, self.y_min, self.y_max, self.log_y)
 
     def line(self, points: Sequence[Point], css: str) -> None:
         """Draws a line with gaps where a value is None."""
@@ -64,16 +54,17 @@ class Chart:
 
     def dots(self, points: Sequence[tuple[float, float]], css: str) -> None:
         """Draws a mark at each point, one at most where several would cover each other."""
-        kept = thin_marks([(self.x(a), self.y(b)) for a, b in points], MARK)
-        if kept:
-            path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in kept)
-            self.marks.append(f'<path class="points {css}" d="{path}"/>')
+        self._single_marks(points, f"points {css}", 0, "h0")
 
     def crosses(self, points: Sequence[tuple[float, float]], css: str) -> None:
+        """As ``dots``."""
+        self._single_marks(points, f"crosses {css}", 4, "l8 8m0-8l-8 8")
+
+    def _single_marks(self, points: Sequence[tuple[float, float]], css: str, reach: int, shape: str) -> None:
         kept = thin_marks([(self.x(a), self.y(b)) for a, b in points], MARK)
         if kept:
-            path = "".join(f"M{x - 4:.1f} {y - 4:.1f}l8 8m0-8l-8 8" for x, y in kept)
-            self.marks.append(f'<path class="crosses {css}" d="{path}"/>')
+            path = "".join(f"M{x - reach:.1f} {y - reach:.1f}{shape}" for x, y in kept)
+            self.marks.append(f'<path class="{css}" d="{path}"/>')
 
     def area(self, points: Sequence[Point], css: str) -> None:
         """Fills the area between the bottom of the chart and the line."""
@@ -134,28 +125,43 @@ class Chart:
         )
 
     def svg(self, label: str) -> str:
-        cursor = f'<line class="cursor" y1="{TOP}" y2="{self.height - AXIS}"/>' if self.follow else ""
-        data = (
-            f' data-x0="{self.gutter}" data-x1="{self.width - RIGHT}" data-t1="{self.x_max:.3f}"' if self.follow else ""
-        )
-        return (
-            f'<svg class="chart" viewBox="0 0 {self.width} {self.height}" role="img"{data} '
-            f'aria-label="{escape(label)}">'
-            f"{self._grid()}{''.join(self.marks)}{cursor}</svg>"
+        return self._svg(self._grid(), "chart", TOP, label)
+
+    def _svg(self, grid: str, css: str, top: int, label: str) -> str:
+        """``top``: upper end of the line at the pointer's time."""
+        cursor, data = "", ""
+        if self.follow:
+            cursor = f'<line class="cursor" y1="{top}" y2="{self.height - AXIS}"/>'
+            data = f' data-x0="{self.gutter}" data-x1="{self.width - RIGHT}" data-t1="{self.x_max:.3f}"'
+        return Markup(
+            f'<svg class="{css}" viewBox="0 0 {self.width} {self.height}" role="img"{data} '
+            f'aria-label="{escape(label)}">{grid}{"".join(self.marks)}{cursor}</svg>'
         )
 
     def _grid(self) -> str:
         parts = []
-        floor = self.height - AXIS
         for value in ticks(self.y_min, self.y_max, 5, self.log_y):
             y = self.y(value)
             parts.append(f'<line class="grid" x1="{self.gutter}" x2="{self.width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
             text = escape(f"{value:g} {self.y_unit}".strip())
             parts.append(f'<text x="{self.gutter - 8}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
+        return "".join(parts) + self._x_axis()
+
+    def _x_axis(self) -> str:
+        y, parts = self.height - AXIS + 18, []
         for value in ticks(self.x_min, self.x_max, TICKS_X * self.width // WIDTH, self.log_x, self.x_unit == "s"):
             text = clock(value) if self.x_unit == "s" else f"{value:g} {self.x_unit}"
-            parts.append(f'<text x="{self.x(value):.1f}" y="{floor + 18}" text-anchor="middle">{escape(text)}</text>')
+            parts.append(f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{escape(text)}</text>')
         return "".join(parts)
+
+
+def _share(value: float, low: float, high: float, log: bool) -> float:
+    """Where the value is between the ends of its axis, 0 to 1."""
+    if log:
+        share = math.log10(max(value, low) / low) / math.log10(high / low)
+    else:
+        share = (value - low) / max(high - low, 1e-9)
+    return min(1.0, max(0.0, share))
 
 
 @dataclass
@@ -169,27 +175,16 @@ class Band:
 def strips(bands: Sequence[Band], x_max: float, label: str, gutter: int = GUTTER) -> str:
     """Draws rows of coloured intervals over one time axis. ``gutter``: left margin for their names, SVG units."""
     row, gap = 20, 8
-    height = len(bands) * (row + gap) + AXIS
-    axis = Chart(x_max=x_max, y_min=0, y_max=1, height=height, gutter=gutter)
-    parts = []
+    chart = Chart(x_max=x_max, y_min=0, y_max=1, height=len(bands) * (row + gap) + AXIS, gutter=gutter)
     for i, band in enumerate(bands):
         top = i * (row + gap)
-        parts.append(f'<text x="{gutter - 8}" y="{top + 14}" text-anchor="end">{escape(band.name)}</text>')
-        parts.append(f'<rect class="rail" x="{gutter}" y="{top}" width="{WIDTH - gutter - RIGHT}" height="{row}"/>')
+        chart.marks += [
+            f'<text x="{gutter - 8}" y="{top + 14}" text-anchor="end">{escape(band.name)}</text>',
+            f'<rect class="rail" x="{gutter}" y="{top}" width="{WIDTH - gutter - RIGHT}" height="{row}"/>',
+        ]
         for low, high, css, tip in thin_spans(band.spans, x_max):
-            left, right = axis.x(low), axis.x(high)
-            parts.append(
-                f'<rect class="{css}" x="{left:.1f}" y="{top}" width="{max(0.8, right - left):.1f}" height="{row}">'
-                f"<title>{escape(tip)}</title></rect>"
-            )
-    for value in ticks(0.0, x_max, TICKS_X, sixties=True):
-        parts.append(f'<text x="{axis.x(value):.1f}" y="{height - 8}" text-anchor="middle">{clock(value)}</text>')
-    parts.append(f'<line class="cursor" y1="0" y2="{height - AXIS}"/>')
-    data = f'data-x0="{gutter}" data-x1="{WIDTH - RIGHT}" data-t1="{x_max:.3f}"'
-    return (
-        f'<svg class="chart strips" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(label)}" {data}>'
-        f"{''.join(parts)}</svg>"
-    )
+            chart._block(low, high, top, top + row, css, tip)
+    return chart._svg(chart._x_axis(), "chart strips", 0, label)
 
 
 def ticks(low: float, high: float, count: int, log: bool = False, sixties: bool = False) -> list[float]:
@@ -217,6 +212,11 @@ def clock(seconds: float) -> str:
     hours, rest = divmod(whole, 3600)
     minutes, rest = divmod(rest, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def stamp(t_s: float | None) -> str:
+    """Formats a time of a flight: what was before its beginning is at 0:00, None is ""."""
+    return "" if t_s is None else clock(round(max(0.0, t_s)))
 
 
 def spans_of(samples: Sequence[tuple[float, str]], end: float) -> list[tuple[float, float, str]]:
