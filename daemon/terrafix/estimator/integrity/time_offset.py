@@ -36,7 +36,7 @@ MIN_TURN_SIGMA_RAD, MIN_TILT_SIGMA_RAD = np.radians(0.1), np.radians(0.05)  # of
 # 1-sigma of the mount's tilt, by which a roll looks like a turn, or a jump [spec: twice that of turn_comparison.py]
 MOUNT_SIGMA_RAD = np.radians(3.0)
 INERTIAL_SIGMA_MPS2 = 0.2  # with them: a tilt that is wrong by a degree [spec: attitude_sigma_deg]
-NOISE_MEMORY = 50.0  # comparisons: 20 s [spec: twice attitude_slow_s, terrafix_lab/sim/sensors/errors.py]
+NOISE_MEMORY = 50.0  # comparisons: 20 s [spec: twice attitude_slow_s of the simulated sensors]
 INDEPENDENT_SHARE = 0.5  # of the comparisons: two consecutive ones share a frame [tuned]
 # Least share of the noise that the images have. Without a limit two of three healthy flights had a false offset.
 MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
