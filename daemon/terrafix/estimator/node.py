@@ -311,7 +311,10 @@ class EstimatorNode:
             orientation = estimator.state.orientation.fault
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
-            time_offset.add(stamped, self._telemetry, agl_m)
+            if estimator.state.orientation.suspects:  # turned or mirrored images move otherwise at any time
+                time_offset.forget_images()
+            else:
+                time_offset.add(stamped, self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
         yield from self._start_fault(estimator, odometry.t_ns)
         budget = self._claim(result.placed)

@@ -108,6 +108,11 @@ class TimeOffset:
         self._density: np.ndarray | None = None  # of the newest frame
         self._reported_s: float | None = None
 
+    def forget_images(self) -> None:
+        """The newest images contradict their description: those that wait for attitudes tell nothing of the time."""
+        self._pending.clear()
+        self._chain, self._before, self._velocity = {}, None, None
+
     def add(self, odometry: Odometry, telemetry: Telemetry, agl_m: float) -> None:
         """A frame, at its uncorrected time stamp."""
         self._stamps_ns = {frame: t for frame, t in self._stamps_ns.items() if frame >= odometry.keyframe_id}

@@ -8,16 +8,18 @@ import math
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
 from terrafix.core.errors import SourceError
-from terrafix.core.mavlink.tlog import TelemetryLog
 from terrafix.core.toml_file import read_toml
 from terrafix.messages import Camera, Origin
 from terrafix.vision.sources.plausible import check_camera, check_centre
+
+if TYPE_CHECKING:
+    from terrafix.core.mavlink.tlog import TelemetryLog
 
 START_SIGMA_M = 10.0  # a coordinate from a map or a phone before take-off
 YAW_SIGMA_DEG = 5.0  # compass of a small multirotor near its motors
@@ -181,8 +183,10 @@ def origin_of(description: Description, camera: Camera, start: tuple[float, floa
     )
 
 
-def telemetry_log(path: Path, description: Description) -> TelemetryLog:
+def telemetry_log(path: Path, description: Description) -> "TelemetryLog":
     """The log of a flight, with the zero and the vehicle that its description states. Raises SourceError."""
+    from terrafix.core.mavlink.tlog import TelemetryLog  # the console reads descriptions and no telemetry
+
     return TelemetryLog(path, description.telemetry.tlog_t0_us, description.telemetry.system_id)
 
 

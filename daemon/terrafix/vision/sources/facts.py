@@ -4,10 +4,12 @@ that its log has, and what is left out and why."""
 import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
-from terrafix.core.mavlink.tlog import TelemetryLog
 from terrafix.messages import Camera, Origin, VehicleState
+
+if TYPE_CHECKING:
+    from terrafix.core.mavlink.tlog import TelemetryLog
 
 GAP_TIMES = 3.0  # a gap is longer than this many times the median interval
 
@@ -82,7 +84,7 @@ def telemetry_facts(states: Sequence[VehicleState], whence: str) -> Iterator[Fac
             yield Fact(topic, f"{count} values from {whence}" if count else "not stated")
 
 
-def log_facts(log: TelemetryLog, stated_zero: bool) -> Iterator[Fact]:
+def log_facts(log: "TelemetryLog", stated_zero: bool) -> Iterator[Fact]:
     """Clock, vehicles and damage of a telemetry log."""
     zero = "[telemetry] tlog_t0_us" if stated_zero else "the first record of the log"
     yield Fact("clock", f"{log.path.name}: arrival times of its records; zero is {zero}")
