@@ -2,9 +2,11 @@
 
 import re
 from html.parser import HTMLParser
+from io import BytesIO
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from flight_records import PERIOD_NS, frame, live_messages, origin, write_record, write_truth
 from terrafix.core.config import Config
@@ -181,7 +183,10 @@ def test_the_report_of_a_truncated_record_states_the_truncation(tmp_path: Path) 
 def test_damaged_parts_of_a_record_are_named(tmp_path: Path) -> None:
     write_record(tmp_path / "flight-000.mcap", live_messages(400))
     data = bytearray((tmp_path / "flight-000.mcap").read_bytes())
-    data[len(data) // 40] ^= 1  # in the first chunk
+    summary = make_reader(BytesIO(data)).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[len(summary.chunk_indexes) // 2]
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     (tmp_path / "flight-000.mcap").write_bytes(data)
     assert "1 damaged part(s) of the record were left out: flight-000.mcap, byte " in page_of(tmp_path).text
 
