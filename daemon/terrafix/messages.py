@@ -483,6 +483,16 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
     joined: bool = True  # ... is joined to the flight (as in Prediction)
 
+    @property
+    def is_placed(self) -> bool:
+        """A place stands behind the position; else its coordinates are neither shown nor used."""
+        return self.source_label is not SourceLabel.NOT_PLACED
+
+    @property
+    def amsl_m(self) -> float | None:
+        """Height above mean sea level [m]; None: no elevation is known."""
+        return self.alt_amsl_m if self.amsl_known else None
+
 
 class PoseMethod(StrEnum):
     """Method by which the camera pose of a map match was computed."""

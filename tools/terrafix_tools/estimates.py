@@ -9,7 +9,7 @@ from typing import TextIO
 
 from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import rot_from_quat, yaw_of
-from terrafix.messages import Frame, Message, NavEstimate, Refinement, SourceLabel
+from terrafix.messages import Frame, Message, NavEstimate, Refinement
 
 
 @dataclass
@@ -89,9 +89,9 @@ class RowTable:
 
     @staticmethod
     def _estimate(row: Row, estimate: NavEstimate) -> None:
-        placed = estimate.source_label is not SourceLabel.NOT_PLACED
+        placed = estimate.is_placed
         row.lat_deg, row.lon_deg = (estimate.lat_deg, estimate.lon_deg) if placed else (None, None)
-        row.alt_amsl_m, row.agl_m = estimate.alt_amsl_m if estimate.amsl_known else None, estimate.agl_m
+        row.alt_amsl_m, row.agl_m = estimate.amsl_m, estimate.agl_m
         row.sigma_e_m = math.sqrt(estimate.cov[0]) if placed else None
         row.sigma_n_m = math.sqrt(estimate.cov[7]) if placed else None
         row.cov_en_m2 = estimate.cov[1] if placed else None

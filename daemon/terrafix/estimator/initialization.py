@@ -176,8 +176,7 @@ def _start(
     confirmed: bool = True,
 ) -> FrameState:
     """A new graph with the reported attitude and height. ``covs``: of the pose (6, 6) in world axes, of B (6, 6) and of
-    V (8, 8). ``ground_m``: AMSL, below the camera. ``joined``, ``confirmed``: as in
-    ``reset``."""
+    V (8, 8). ``ground_m``: AMSL, below the camera. ``joined``, ``confirmed``: as in ``reset``."""
     cov, calibration_cov, motion_cov = covs
     r_w_c = first.pose.rotation().matrix()
     gauge = state.yaw_gauge

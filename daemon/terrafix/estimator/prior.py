@@ -25,7 +25,6 @@ from terrafix.messages import (
     Message,
     NavEstimate,
     Origin,
-    SourceLabel,
     Vec2,
 )
 from terrafix.runtime.checkpoint import CheckpointFile
@@ -114,7 +113,6 @@ class NavPrior:
         if calibration is not None and estimate.t_ns - calibration.t_ns <= MAX_CALIBRATION_AGE_NS:
             cov = np.array(calibration.cov).reshape(CALIBRATION_SIZE, CALIBRATION_SIZE)
             learnt = CalibrationPrior(calibration.t_ns * 1e-9, np.array(calibration.state), cov)
-        placed = estimate.source_label is not SourceLabel.NOT_PLACED
         return cls(
             t_s,
             at_m,
@@ -125,7 +123,7 @@ class NavPrior:
             learnt,
             checkpoint.ground,
             lens,
-            placed,
+            estimate.is_placed,
         )
 
     def path_until(self, t_s: float, yaw_rad: float | None) -> tuple[np.ndarray, float]:

@@ -11,7 +11,7 @@ import msgspec
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.log_lines import MessageLog
-from terrafix.messages import Message, NavEstimate, Origin, SourceLabel
+from terrafix.messages import Message, NavEstimate, Origin
 
 NS = 1_000_000_000
 LOCATION_TOPIC, POSE_TOPIC, LOG_TOPIC = "/location", "/pose", "/log"
@@ -122,7 +122,7 @@ class FoxgloveMessages:
         """Yields (topic, derived message)."""
         if isinstance(message, Origin):
             self._frame = LocalFrame(message.lat_deg, message.lon_deg)
-        elif isinstance(message, NavEstimate) and message.source_label is not SourceLabel.NOT_PLACED:
+        elif isinstance(message, NavEstimate) and message.is_placed:
             yield LOCATION_TOPIC, _location(message)
             if self._frame is not None:
                 yield POSE_TOPIC, _pose(message, self._frame)

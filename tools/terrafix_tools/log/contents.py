@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from terrafix.messages import Frame, Message, NavEstimate, Origin, SourceLabel, WallClock
+from terrafix.messages import Frame, Message, NavEstimate, Origin, WallClock
 from terrafix.recorder.reader import ReadResult, check_format, read_received
 
 NS = 1_000_000_000
@@ -38,7 +38,7 @@ class Contents:
         self.last_ns = max(self.last_ns, t_ns)
         if isinstance(message, Frame):
             self.frames.add(message.frame_id)
-        elif isinstance(message, NavEstimate) and message.source_label is not SourceLabel.NOT_PLACED:
+        elif isinstance(message, NavEstimate) and message.is_placed:
             self.localised.add(message.frame_id)
         elif isinstance(message, WallClock) and message.unix_ns is not None:
             self.unix_offset_ns = message.unix_ns - message.t_ns

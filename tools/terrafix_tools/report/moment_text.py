@@ -42,6 +42,7 @@ SOURCES = {
     "satellite_anchored": "from a map match",
     "visual_propagated": "carried on by odometry",
     "dead_reckoned": "dead reckoning: neither map nor odometry",
+    "not_placed": "not placed: no map match yet, and no known start",
 }
 TEXTS_WITHIN_S = 5.0  # texts to the pilot that belong to a moment
 MIN_MASS = 0.005  # of a place that is listed
@@ -63,7 +64,7 @@ def facts(view: FlightView, moment: Moment, own: FrameRecord, shown: FrameRecord
 def _position(view: FlightView, moment: Moment) -> str:
     row = view.rows[moment.row]
     if not row.localised:
-        return "not placed: no map match yet, and no known start" if row.source_label == "not_placed" else "none"
+        return SOURCES.get(row.source_label, "none")
     parts = [SOURCES.get(row.source_label, "")]
     if (radius_m := radius95_m(row)) is not None:
         parts.append(f"95 % radius {radius_m:.1f} m")

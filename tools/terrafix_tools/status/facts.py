@@ -13,7 +13,6 @@ from terrafix.messages import (
     NavEstimate,
     PositionSource,
     SearchState,
-    SourceLabel,
     ThermalReading,
 )
 from terrafix_tools.report.sections_autopilot import EKF_POS_HORIZ_ABS
@@ -60,12 +59,12 @@ def _position(status: Status, now_ns: int) -> dict[str, Any]:
         "search": None if search is None else search.step.value,
     }
     if estimate is not None:
-        placed = estimate.source_label is not SourceLabel.NOT_PLACED
+        placed = estimate.is_placed
         horizontal = np.reshape(estimate.cov, (6, 6))[:2, :2]
         found |= {
             "lat_deg": round(estimate.lat_deg, 6) if placed else None,
             "lon_deg": round(estimate.lon_deg, 6) if placed else None,
-            "alt_amsl_m": round(estimate.alt_amsl_m, 1) if estimate.amsl_known else None,
+            "alt_amsl_m": _rounded(estimate.amsl_m, 1),
             "agl_m": round(estimate.agl_m, 1),
             "speed_mps": round(float(np.hypot(*estimate.velocity_enu_mps[:2])), 1),
             "radius_95_m": round(float(np.sqrt(CHI2_95 * np.linalg.eigvalsh(horizontal)[-1])), 1) if placed else None,

@@ -18,7 +18,7 @@ from terrafix.estimator.monitors.visual_motion import ground_residual
 ASPECT_RATIOS = (3 / 4, 27 / 32, 32 / 27, 4 / 3)  # [spec: formats of sensors and encoders]
 # RMS residual of the matches of level ground, in heights, that a wrong lens, relief and tilt leave.
 RESIDUAL = 0.005  # [measured: docs/decisions/059-images-against-inertial-sensors.md]
-# Share of the residual that a wrong ratio may undo. [measured: 20 flights over relief without a map, none above it]
+# Share of the residual that a wrong ratio may undo. [measured: no alarm in 20 flights over relief without a map]
 EXPLAINED = 0.5
 COMPONENTS = 2  # of a residual by two scales: one shear, along two axes [spec: geometry]
 

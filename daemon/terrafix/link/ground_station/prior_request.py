@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from terrafix.core.clock import NS_PER_S
 from terrafix.link.integrity.fix_type import DEGRADATION_LEVELS
 from terrafix.link.integrity.output_predictor import worst_horizontal_variance
-from terrafix.messages import NavEstimate, SearchStep, SourceLabel
+from terrafix.messages import NavEstimate, SearchStep
 
 # Frames in a row and time without a known position before the first request. [spec: requirement AC-6]
 MIN_FRAMES, MIN_DURATION_NS = 3, 2 * NS_PER_S
@@ -73,8 +73,7 @@ class PriorRequest:
 
     def on_estimate(self, estimate: NavEstimate) -> None:
         self._route.add(estimate)
-        placed = estimate.source_label is not SourceLabel.NOT_PLACED
-        known = placed and worst_horizontal_variance(estimate.cov) <= UNKNOWN_POSITION_SIGMA_M**2
+        known = estimate.is_placed and worst_horizontal_variance(estimate.cov) <= UNKNOWN_POSITION_SIGMA_M**2
         if known:
             self._frames, self._since_ns = 0, None
         elif estimate.frame_id != self._frame_id:

@@ -20,7 +20,6 @@ from terrafix.messages import (
     Refinement,
     SearchPlaces,
     SearchStep,
-    SourceLabel,
     Verdict,
 )
 from terrafix_tools.console.events import (
@@ -285,10 +284,10 @@ def _result(shown: Frame, estimate: NavEstimate | None, found: MapMatch | None, 
         result.match, result.inliers, result.search = str(found.verdict), found.inliers, str(found.search.step)
     if estimate is not None:
         cov_m2 = np.reshape(estimate.cov, (6, 6))[:2, :2]
-        if estimate.source_label is not SourceLabel.NOT_PLACED:
+        if estimate.is_placed:
             result.gps = _gps(estimate.lat_deg, estimate.lon_deg)
             result.confidence, result.ellipse = confidence_of(cov_m2), ellipse_of(cov_m2)
-        result.altitude = round(estimate.alt_amsl_m, 3) if estimate.amsl_known else None
+        result.altitude = None if estimate.amsl_m is None else round(estimate.amsl_m, 3)
         result.agl_m = round(estimate.agl_m, 3)
         result.heading = round(yaw_deg_of(estimate), 3)
         result.source = str(estimate.source_label)
