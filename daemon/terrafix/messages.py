@@ -132,6 +132,10 @@ class Origin(Message, frozen=True, kw_only=True):
 OVERTAKEN = "overtaken: a newer frame was there first"  # error of a frame that was left out, not of the camera
 
 
+# 1-sigma of the time stamp of a frame against its exposure: exposure, readout and transfer of USB cameras [s].
+STAMP_SIGMA_S = 0.03  # [tuned]
+
+
 class Frame(Message, frozen=True, kw_only=True):
     """A new camera frame, whose pixels are in the frame store under ``frame_id``."""
 
@@ -142,6 +146,7 @@ class Frame(Message, frozen=True, kw_only=True):
     error: str = ""  # not empty: the frame has no pixels; this is the reason
     # A buffer may lie between exposure and ``t_ns``: the stamp is of arrival, or by the sender of a network stream.
     buffered: bool = False
+    stamp_sigma_s: float = STAMP_SIGMA_S  # 1-sigma of ``t_ns`` about the exposure, as far as the source knows
 
 
 class VehicleState(Message, frozen=True, kw_only=True):

@@ -38,7 +38,13 @@ NAMED = {
     "The Unlicense (Unlicense)": "Unlicense",
 }
 # Extras that the check does not install, because they need a compiler or a GPU: read on their pages.
-ELSEWHERE = {"systemd-python": "LGPL-2.1-or-later", "torch": "BSD-3-Clause", "onnx": "Apache-2.0", "onnxscript": "MIT"}
+ELSEWHERE = {
+    "pygobject": "LGPL-2.1-or-later",
+    "systemd-python": "LGPL-2.1-or-later",
+    "torch": "BSD-3-Clause",
+    "onnx": "Apache-2.0",
+    "onnxscript": "MIT",
+}
 TABLE = "|---|---|---|\n"  # the rows of the page follow it
 
 

@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from terrafix.core.errors import ConfigError
+from terrafix.core.passwords import without_password
 from terrafix.core.toml_file import read_toml
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -91,11 +92,14 @@ class HealthSection(Section, frozen=True, kw_only=True):
 
 
 class SourceSection(Section, frozen=True, kw_only=True):
-    path: str = ""  # flight folder, photo folder, video file, /dev/video* or a GStreamer pipeline
+    path: str = ""  # flight folder, photo folder, video file, or a camera (vision/sources/stream_address.py)
     realtime: bool = True  # play a recorded source in real time (live shell only)
     start: str = ""  # "LAT,LON" in degrees, overrides the source; the command line overrides it
     camera: str = ""  # camera description (config/cameras); required for cameras, optional for photos and videos
     rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0  # frames per second taken from a video or a camera
+    latency_ms: Annotated[float, Meta(ge=0, le=2000)] = 0.0  # of a camera, from exposure to time stamp
+    latency_sigma_ms: Annotated[float, Meta(ge=0, le=2000)] = 0.0  # its 1-sigma; 0: as usual for the kind of camera
+    sender_clock: bool = False  # the clock of an RTSP camera is synchronised: its sender reports give the exposure
 
 
 class RuntimeSection(Section, frozen=True, kw_only=True):
@@ -122,6 +126,12 @@ class Config(Section, frozen=True, kw_only=True):
     runtime: RuntimeSection = RuntimeSection()
     smoother: SmootherSection = SmootherSection()
     log: LogSection = LogSection()
+
+
+def without_passwords(config: Config) -> Config:
+    """For logs and records."""
+    source = msgspec.structs.replace(config.source, path=without_password(config.source.path))
+    return msgspec.structs.replace(config, source=source)
 
 
 def load(paths: list[Path]) -> Config:

@@ -255,7 +255,7 @@ class EstimatorNode:
 
     def _on_frame(self, frame: Frame) -> Iterable[Message]:
         if self._flight is not None:
-            self._flight.time_offset.buffered = frame.buffered
+            self._flight.time_offset.stamped(frame)
         return ()
 
     def _on_odometry(self, odometry: Odometry) -> Iterable[Message]:

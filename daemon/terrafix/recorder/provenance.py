@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from terrafix.core.config import Config, Models
+from terrafix.core.config import Config, Models, without_passwords
 from terrafix.core.errors import MapError
 from terrafix.map.format import MANIFEST_TABLE
 from terrafix.map.verify import connect
@@ -32,7 +32,7 @@ def header(config: Config, map_path: Path | None = None, facts: Sequence[tuple[s
 
     ``map_path``: map package; None: there is none. ``facts``: what the source says of itself, by topic."""
     parts = {
-        "config": config,
+        "config": without_passwords(config),
         "versions": versions(),
         "map": map_of(map_path),
         "models": models_of(config.models),

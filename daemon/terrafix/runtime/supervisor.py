@@ -20,7 +20,7 @@ import zmq
 from terrafix.core import config as configuration
 from terrafix.core import logs
 from terrafix.core.clock import Ticker, now_ns
-from terrafix.core.config import Config
+from terrafix.core.config import Config, without_passwords
 from terrafix.core.errors import MapError, OutputError
 from terrafix.core.log_lines import MessageLog
 from terrafix.messages import LogLine, ProcessEvent, SourceEnded
@@ -107,7 +107,9 @@ def run(
         stack.enter_context(
             contextlib.closing(logs.configure(config.log.level, SUPERVISOR, output or systemd.log_stream()))
         )
-        logs.get().info("start", config=msgspec.to_builtins(config), map=str(package), out_dir=str(out_dir))
+        logs.get().info(
+            "start", config=msgspec.to_builtins(without_passwords(config)), map=str(package), out_dir=str(out_dir)
+        )
         spec = msgspec.json.encode(spec_of(table, config, package, out_dir, options.ground_amsl_m))
         owned = OwnedRunDir(spec=spec, resume=is_camera(config.source.path))
         stack.callback(owned.remove)

@@ -25,7 +25,7 @@ EXTRAS = {  # libraries, without our own distribution for the ground
     extra: {canonicalize_name(Requirement(r).name): Requirement(r) for r in requirements if GROUND["name"] not in r}
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
-WITHOUT_GROUND = {"vehicle", "faiss", "dev", "docs", "nightly"}  # what a vehicle may have, and the checks
+WITHOUT_GROUND = {"vehicle", "gstreamer", "faiss", "dev", "docs", "nightly"}  # what a vehicle may have, and the checks
 IMPORTED_AS = {
     "foxglove-schemas-protobuf": "foxglove_schemas_protobuf",
     "protobuf": "google",
@@ -36,6 +36,7 @@ IMPORTED_AS = {
     "python-multipart": "python_multipart",
     "faiss-cpu": "faiss",
     "systemd-python": "systemd",
+    "pygobject": "gi",
 }
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # used by scripts/check or the build
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
@@ -93,7 +94,7 @@ def test_every_dependency_has_a_version_range() -> None:
         *CORE.values(),
         *(
             one
-            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "console", "vehicle", "train")
+            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "console", "vehicle", "gstreamer", "train")
             for one in EXTRAS[extra].values()
         ),
     ]:

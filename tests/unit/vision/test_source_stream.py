@@ -15,7 +15,7 @@ from source_folders import HEIGHT, TOML, WIDTH, jpeg, picture
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources import Shot, Source, open_source
-from terrafix.vision.sources.mjpeg import TIMEOUT_S
+from terrafix.vision.sources.capture import STALL_S
 from terrafix_lab.sim.camera.stream import FrameStream
 
 pytestmark = pytest.mark.real_time
@@ -132,7 +132,7 @@ def test_closing_does_not_wait_for_a_camera_that_is_connected_and_sends_nothing(
             closed_s = time.monotonic()
             opened[0].close()
             reading.join(10.0)
-    assert not reading.is_alive() and time.monotonic() - closed_s < TIMEOUT_S / 2
+    assert not reading.is_alive() and time.monotonic() - closed_s < STALL_S / 2
 
 
 def test_a_slow_mjpeg_client_does_not_block_the_server(description: Path) -> None:

@@ -17,6 +17,7 @@ from terrafix.link.output import gps_time
 from terrafix.map.package import MapPackage
 from terrafix.vision.sources import open_configured, parse_start
 from terrafix.vision.sources.description import read_description
+from terrafix.vision.sources.stream_address import is_live
 from terrafix_engines.correlation import open_correlator
 from terrafix_engines.features import open_describer
 from terrafix_engines.features.xfeat import XFeatDescriber
@@ -35,7 +36,6 @@ MIN_FREE_MB = 2000  # space for a flight of an hour with thumbnails
 MIN_MEAN, MAX_MEAN = 15.0, 240.0  # limits of the mean grey value, of 255
 MIN_CONTRAST = 6.0  # least standard deviation of an image; below: lens cap, a wall, fog
 MIN_FINE_SHARE = 0.08  # share of the contrast within two pixels; sharp images of ground have 0.2 and more
-LIVE = ("/dev/", "http://", "https://")
 
 
 def check_lines(config: Config, mission: Path | None, out: Path) -> Iterator[Line]:
@@ -124,7 +124,7 @@ def _camera(config: Config) -> Iterator[Line]:
     if not spec:
         yield fail("camera", "the configuration has no source", "set [source] path")
         return
-    if not (spec.startswith(LIVE) or "!" in spec or spec.isdecimal()):
+    if not is_live(spec):
         yield warn("camera", f"{spec} is a recording, not a camera", "for a flight set [source] path to the camera")
         return
     try:

@@ -16,7 +16,7 @@ def options() -> None:
 
 @app.command()
 def info(
-    source: Annotated[str, typer.Argument(help="Flight folder, photos, video, /dev/video0 or GStreamer pipeline.")],
+    source: Annotated[str, typer.Argument(help="Flight folder, photos, video, camera: docs/cameras.md.")],
     start: Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")] = "",
     config: Annotated[list[Path] | None, typer.Option("--config", help="TOML file; its [source] is used.")] = None,
     json_only: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
@@ -24,6 +24,7 @@ def info(
     """Camera, lens, start, clock, rate and gaps, vehicles heard: where each comes from, and what is left out and
     why."""
     from terrafix.core.config import load
+    from terrafix.core.passwords import without_password
     from terrafix.vision.sources import open_configured, parse_start
     from terrafix.vision.sources.facts import facts_of
     from terrafix_tools.source.text import fact_lines
@@ -32,7 +33,7 @@ def info(
     facts = facts_of(opened)
     opened.close()
     if json_only:
-        typer.echo(json.dumps({"source": source, "facts": [fact._asdict() for fact in facts]}, indent=2))
+        typer.echo(json.dumps({"source": without_password(source), "facts": [fact._asdict() for fact in facts]}, indent=2))
         return
     for line in fact_lines(opened.name(), facts):
         typer.echo(line)

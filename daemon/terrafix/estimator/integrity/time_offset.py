@@ -19,11 +19,9 @@ from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.monitors.levelling import ACCELERATION_SIGMA_MPS2
 from terrafix.estimator.monitors.visual_motion import MIN_DOWN, MIN_PAIRS
-from terrafix.messages import CalibrationFault, Odometry, Verdict
+from terrafix.messages import STAMP_SIGMA_S, CalibrationFault, Frame, Odometry, Verdict
 
-# 1-sigma of the offset of frames that are stamped on arrival: exposure, readout and transfer of USB cameras [s].
-PRIOR_SIGMA_S = 0.03  # [tuned]
-FAR_S = 3.0 * PRIOR_SIGMA_S  # s: a larger offset is not that of transfer alone [spec: three sigmas]
+FAR_S = 3.0 * STAMP_SIGMA_S  # s: a larger offset is not that of transfer alone [spec: three sigmas]
 UNSTAMPED_SHARE = 0.01  # of cameras whose buffers or pipeline may delay by anything on the grid [tuned]
 OUTSIDE_S = 5.0  # s, 1-sigma of an offset at the end of the grid, or beyond it [spec: the width of the grid]
 # Hazard of a buffer that lies between exposure and stamp: one that begins to fill in an hour of flight, one that jumps
@@ -86,7 +84,7 @@ class _Velocity:
 class TimeOffset:
     """``applied_s``: the offset to subtract from the time stamps of frames; 0 until it is significant.
 
-    ``r_b_c`` (3, 3): mount of the camera. ``buffered``: whether a buffer may lie between exposure and stamp."""
+    ``r_b_c`` (3, 3): mount of the camera."""
 
     def __init__(self, r_b_c: np.ndarray) -> None:
         self.applied_s = 0.0
@@ -98,15 +96,21 @@ class TimeOffset:
         self._chain: dict[int, _Levelled] = {}
         self._before: _Levelled | None = None
         self._velocity: _Velocity | None = None
-        stamped = np.exp(-0.5 * (GRID_S / PRIOR_SIGMA_S) ** 2)
-        self._mass = np.zeros((len(RATES), len(GRID_S)))  # at ``_at_ns``
-        self._mass[0] = (1.0 - UNSTAMPED_SHARE) * stamped / stamped.sum() + UNSTAMPED_SHARE / len(GRID_S)
+        self._prior_sigma_s = STAMP_SIGMA_S
+        self._mass = _prior(STAMP_SIGMA_S)  # at ``_at_ns``
         self._at_ns: int | None = None  # stamp of the newest frame that was compared ...
         self._newest_ns = 0  # ... and of the newest one
         # Variances of turns [rad^2] and of changes of velocity [heights^2/s^2, each axis]: first guess, then learnt.
         self._noise = [np.radians(0.5) ** 2, 0.02**2]
         self._density: np.ndarray | None = None  # of the newest frame
         self._reported_s: float | None = None
+
+    def stamped(self, frame: Frame) -> None:
+        """How its source stamps ``frame``: the prior until a first image is compared, and how often an offset begins to
+        drift or jumps."""
+        self.buffered = frame.buffered
+        if self._at_ns is None and frame.stamp_sigma_s != self._prior_sigma_s:
+            self._prior_sigma_s, self._mass = frame.stamp_sigma_s, _prior(frame.stamp_sigma_s)
 
     def forget_images(self) -> None:
         """The newest images contradict their description: those that wait for attitudes tell nothing of the time."""
@@ -153,7 +157,9 @@ class TimeOffset:
         remaining_s = self._sigma_about(self.applied_s)
         if float(self.density[-2:].sum() + self.density[:2].sum()) >= MIN_COMPONENT_WEIGHT:
             return max(remaining_s, OUTSIDE_S)
-        return remaining_s if self._far(self.applied_s) >= MIN_COMPONENT_WEIGHT else min(remaining_s, PRIOR_SIGMA_S)
+        return (
+            remaining_s if self._far(self.applied_s) >= MIN_COMPONENT_WEIGHT else min(remaining_s, self._prior_sigma_s)
+        )
 
     def step(self, dt_s: float) -> None:
         """Moves ``applied_s`` towards the estimate where that is known and not 0, towards 0 where it is 0; elsewhere it
@@ -255,6 +261,14 @@ class TimeOffset:
         self._noise[kind] += (likely2 - self._noise[kind]) / NOISE_MEMORY
         shrunk2 = np.abs(mean + gain * (residual - mean)) ** 2
         return np.asarray(-0.5 * INDEPENDENT_SHARE * axes * (shrunk2 / variance + np.log(variance)))
+
+
+def _prior(sigma_s: float) -> np.ndarray:
+    """(R, L) mass of a constant offset with ``sigma_s`` about 0, and of some share anywhere."""
+    mass = np.zeros((len(RATES), len(GRID_S)))
+    stamped = np.exp(-0.5 * (GRID_S / sigma_s) ** 2)
+    mass[0] = (1.0 - UNSTAMPED_SHARE) * stamped / stamped.sum() + UNSTAMPED_SHARE / len(GRID_S)
+    return mass
 
 
 def _jump(before: _Velocity, now: _Velocity, agl_m: float, telemetry: Telemetry) -> tuple[np.ndarray, float]:

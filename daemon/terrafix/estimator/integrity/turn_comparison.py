@@ -12,11 +12,11 @@ import numpy as np
 from terrafix.estimator.integrity.offset_drift import STEP_S
 from terrafix.estimator.integrity.time_offset import (
     INDEPENDENT_SHARE,
-    PRIOR_SIGMA_S,
     REPORT_WAIT_NS,
     UNSTAMPED_SHARE,
 )
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.messages import STAMP_SIGMA_S
 
 GRID_S = np.arange(-2.0, 2.0001, STEP_S)  # s: offsets of the density [spec: offset_drift.py, to 2 s both ways]
 MIN_TURN_SIGMA_RAD = np.radians(0.3)  # lower limit of the 1-sigma of a turn between two frames [tuned]
@@ -63,7 +63,7 @@ class TurnComparison:
         independently of them", near 0 without turns; and the same for a single turn."""
         if self._count == 0.0:
             return 0.0, 0.0
-        prior = (1.0 - UNSTAMPED_SHARE) * _normal(GRID_S, PRIOR_SIGMA_S)
+        prior = (1.0 - UNSTAMPED_SHARE) * _normal(GRID_S, STAMP_SIGMA_S)
         prior += UNSTAMPED_SHARE / (GRID_S[-1] - GRID_S[0])
         independent = self._turned2 / self._count + MIN_TURN_SIGMA_RAD**2
         log = self._log_likelihood(self._noise) - self._log_likelihood(independent)

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from terrafix.core.config import SourceSection
 from terrafix.core.errors import SourceError, UsageError
-from terrafix.vision.sources.contract import Shot, Source
+from terrafix.vision.sources.contract import UNKNOWN_TIMING, Shot, Source, Timing
 from terrafix.vision.sources.images import IMAGE_SUFFIXES, is_image_name
+from terrafix.vision.sources.stream_address import is_live
 
 __all__ = ["VIDEO_SUFFIXES", "Shot", "Source", "open_configured", "open_source", "parse_start"]
 
@@ -19,23 +20,26 @@ def open_source(
     start: tuple[float, float] | None = None,
     camera: Path | None = None,
     rate_hz: float = 2.0,
+    timing: Timing = UNKNOWN_TIMING,
     wait_for_camera: bool = False,
 ) -> Source:
-    """Opens a flight folder, photos, a video file, a V4L2 device, a GStreamer pipeline or MJPEG over HTTP.
+    """Opens a flight folder, photos, a video file, or a camera: ``stream_address.is_live``.
 
     ``start`` (lat_deg, lon_deg) overrides the initial position of the source. ``camera``: a camera description; live
     cameras require it, for photos and videos it overrides theirs. ``rate_hz``: frame rate taken from a video or camera.
-    ``wait_for_camera``: a missing camera is no error; ``shots`` waits for it (a restart in flight).
+    ``timing``: of a camera. ``wait_for_camera``: a missing camera is no error; ``shots`` waits for it (a restart in
+    flight).
     Raises SourceError: one line with the problem and the remedy."""
     if not spec.strip():
         raise SourceError(
-            "no source given; name a flight folder, photos, a video, /dev/videoN, http://... or a GStreamer pipeline"
+            "no source given; name a flight folder, photos, a video, /dev/videoN, csi://0, rtsp://..., "
+            "udp://:5600, http://... or a GStreamer pipeline"
         )
     on_disk = os.path.exists(os.path.expanduser(spec)) and not spec.startswith("/dev/")
-    if not on_disk and (spec.isdecimal() or spec.startswith(("/dev/", "http://", "https://")) or "!" in spec):
+    if not on_disk and is_live(spec):
         from terrafix.vision.sources.camera import LiveCamera
 
-        return LiveCamera(spec, start, camera, rate_hz, wait=wait_for_camera)
+        return LiveCamera(spec, start, camera, rate_hz, timing=timing, wait=wait_for_camera)
     if not on_disk:
         raise SourceError(f"{spec}: no such flight folder, photo folder, video or camera; check the path")
     path = Path(spec).expanduser()
@@ -67,6 +71,7 @@ def open_configured(
         start=start or parse_start(section.start),
         camera=Path(section.camera).expanduser() if section.camera else None,
         rate_hz=section.rate_hz,
+        timing=Timing(1e-3 * section.latency_ms, 1e-3 * section.latency_sigma_ms, section.sender_clock),
         wait_for_camera=wait_for_camera,
     )
 

@@ -3,13 +3,24 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from terrafix.messages import Frame, Imu, Message, Origin, VehicleState
 
 TimedMessage = TypeVar("TimedMessage", VehicleState, Imu)
+
+
+class Timing(NamedTuple):
+    """What is known of the time from exposure to time stamp. ``sigma_s`` 0: as usual for the kind of camera."""
+
+    latency_s: float = 0.0
+    sigma_s: float = 0.0
+    sender_clock: bool = False  # that of a camera on the network is synchronised with this computer's
+
+
+UNKNOWN_TIMING = Timing()
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ import numpy as np
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
+from terrafix.messages import STAMP_SIGMA_S
+from terrafix.vision.sources.capture import NETWORK_SIGMA_S, STALL_S, Stamp
 from terrafix.vision.sources.images import stated_size
 
-TIMEOUT_S = 5.0  # time-out without data after which the camera counts as lost; ten images at 2 Hz
 MAX_PART_BYTES = 64 << 20  # limit; larger than the images of any camera
 MAX_LINE_BYTES = 8192
 MAX_PIXELS = 50_000_000  # of an image, 150 MB; larger than those of any camera that streams
@@ -25,7 +26,9 @@ STAMP_HEADER = "x-timestamp-ns"
 
 
 class MjpegCapture:
-    """An open stream with the cv2.VideoCapture methods that ``LiveCamera`` uses."""
+    """An open stream (``capture.Capture``)."""
+
+    why = "the stream has ended, stalled or is malformed"
 
     def __init__(self, url: str, on_connect: Callable[[socket.socket], None] = lambda _socket: None) -> None:
         """``on_connect``: is given the socket before the camera has answered; another thread that shuts it down ends a
@@ -36,7 +39,7 @@ class MjpegCapture:
         address = urllib.parse.urlsplit(url)
         connection_type = http.client.HTTPSConnection if address.scheme == "https" else http.client.HTTPConnection
         try:
-            self._connection = connection_type(address.hostname or "", address.port, timeout=TIMEOUT_S)
+            self._connection = connection_type(address.hostname or "", address.port, timeout=STALL_S)
             self._connection.connect()
             on_connect(self._connection.sock)
             self._connection.request("GET", address._replace(scheme="", netloc="").geturl() or "/")
@@ -75,9 +78,16 @@ class MjpegCapture:
         image = cv2.imdecode(np.frombuffer(self._jpeg, np.uint8), cv2.IMREAD_COLOR)
         return image is not None, image
 
-    def get(self, prop: int) -> float:
-        """0 (unknown) for every property: the size of a stream is unknown before its first image."""
-        return 0.0
+    def stamp(self, arrival_ns: int) -> Stamp:
+        if self.stamp_ns is None:
+            return Stamp(arrival_ns, True, NETWORK_SIGMA_S)
+        return Stamp(self.stamp_ns, True, STAMP_SIGMA_S)
+
+    def size(self) -> tuple[int, int] | None:
+        return None
+
+    def described(self) -> str:
+        return "MJPEG over HTTP"
 
     def release(self) -> None:
         self._connection.close()

@@ -9,10 +9,19 @@ from inertial_flight import InertialFlight
 from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of, t_ns
 from terrafix.core.camera import Mount
 from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, Hazards, predicted
-from terrafix.estimator.integrity.time_offset import MAX_SLEW, PRIOR_SIGMA_S, TimeOffset
+from terrafix.estimator.integrity.time_offset import MAX_SLEW, TimeOffset
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.pose_estimator import EstimatedFlight
-from terrafix.messages import CalibrationFault, Frame, Imu, NavEstimate, Odometry, Prediction, VehicleState
+from terrafix.messages import (
+    STAMP_SIGMA_S,
+    CalibrationFault,
+    Frame,
+    Imu,
+    NavEstimate,
+    Odometry,
+    Prediction,
+    VehicleState,
+)
 
 R_B_C = Mount.of(CAMERA).r_b_c()
 
@@ -47,7 +56,7 @@ def offset_of(flight: InertialFlight, until_s: float = 1e9) -> TimeOffset:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_camera_in_time_is_not_corrected_and_not_claimed_wider(seed: int) -> None:
     offset = offset_of(InertialFlight(seed, 60, 25))
-    assert offset.applied_s == 0.0 and offset.sigma_s <= PRIOR_SIGMA_S
+    assert offset.applied_s == 0.0 and offset.sigma_s <= STAMP_SIGMA_S
 
 
 def test_an_offset_that_grows_is_followed(plane: InertialFlight) -> None:
@@ -143,7 +152,7 @@ class KnownTo(TimeOffset):
         return share * wide / wide.sum() + (1.0 - share) * (np.abs(GRID_S) < 0.01)
 
 
-@pytest.mark.parametrize(("share", "sigma_s"), [(0.01, PRIOR_SIGMA_S), (1.0, 0.3)])
+@pytest.mark.parametrize(("share", "sigma_s"), [(0.01, STAMP_SIGMA_S), (1.0, 0.3)])
 def test_the_uncertainty_of_the_time_offset_inflates_the_covariance_along_the_velocity(
     share: float, sigma_s: float
 ) -> None:
