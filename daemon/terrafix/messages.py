@@ -14,6 +14,7 @@ Conventions
 from enum import StrEnum
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -54,6 +55,7 @@ class Verdict(StrEnum):
 
     ACCEPTED = "accepted"
     BAD_IMAGE = "bad_image"  # unreadable, truncated, wrong size
+    NO_GROUND = "no_ground"  # the gimbal holds the camera so flat that it sees no ground to match
     OVERTAKEN = "overtaken"  # left out: the computer was busy until a newer frame was there
     STALLED = "stalled"  # the camera repeats an earlier image while the vehicle moves
     NO_FEATURES = "no_features"  # no features to track
@@ -99,6 +101,14 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
 # --- from the source of a flight -----------------------------------------------------------------
 
 
+class Gimbal(msgspec.Struct, frozen=True, kw_only=True):
+    """Gimbal of the camera, which holds it as the mount says: level, image top forward, unless it reports otherwise."""
+
+    required: bool = True  # False: until it reports, the camera counts as fixed to the vehicle
+    device: int = 0  # number that it reports (GimbalAttitude); 0: the first that is heard
+    stabilised: tuple[str, ...] = ("roll", "pitch")  # axes that are level when nothing is reported
+
+
 class Camera(msgspec.Struct, frozen=True, kw_only=True):
     """Pinhole intrinsics for the stored frames (pixels) and orientation of the camera in the body (degrees)."""
 
@@ -114,6 +124,7 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True):
     mount_pitch_deg: float = -90.0  # straight down, image top forward
     mount_roll_deg: float = 0.0
     mount_tolerance_deg: float = 5.0  # 1-sigma of the true tilt about the nominal tilt
+    gimbal: Gimbal | UnsetType = UNSET  # the camera is on it; unset: fixed to the vehicle
 
 
 class Origin(Message, frozen=True, kw_only=True):
@@ -167,6 +178,14 @@ class Imu(Message, frozen=True, kw_only=True):
 
     source: str  # "mavlink"
     samples: list[ImuSample]
+
+
+class GimbalAttitude(Message, frozen=True, kw_only=True):
+    """Attitude of a gimbal, as it reports it."""
+
+    q: Quat  # from its axes (along the view, right, down) to north, east, down, or to heading, right, down
+    from_north: bool  # False: yaw is from the heading of the vehicle
+    device: int = 0  # gimbal_device_id, or component id of the gimbal; 0: the message names none
 
 
 class SourceEnded(Message, frozen=True, kw_only=True):
@@ -474,6 +493,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     velocity_enu_mps: Vec3
     velocity_sigma_mps: float  # 1-sigma in the worst direction
     q_w_b: Quat
+    q_w_c: Quat | UnsetType = UNSET  # of a camera on a gimbal; unset: as q_w_b and the mount say
     cov: Mat6  # of the body pose
     map_sigma_m: float = 0.0  # part of cov: stated error of the map itself, 1-sigma per horizontal axis
     source_label: SourceLabel
@@ -905,6 +925,7 @@ AnyMessage = (
     | Frame
     | VehicleState
     | Imu
+    | GimbalAttitude
     | SourceEnded
     | Odometry
     | Relocalization

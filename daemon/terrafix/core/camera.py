@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from msgspec import UnsetType
 
-from terrafix.messages import Camera
+from terrafix.core.geodesy import rot_from_quat
+from terrafix.messages import Camera, NavEstimate
 
 # Lower bound of the denominator of the division model: a point moves outwards by a factor of 4 at most.
 MIN_UNDISTORTION_DENOMINATOR = 0.25
@@ -107,3 +109,10 @@ class Mount:
         rx = np.array([[1.0, 0, 0], [0, math.cos(r), -math.sin(r)], [0, math.sin(r), math.cos(r)]])
         forward_looking = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # camera z = body x, camera x = body y
         return rz @ ry @ rx @ forward_looking
+
+
+def camera_rotation(estimate: NavEstimate, camera: Camera) -> np.ndarray:
+    """R_w_c (3x3) of an estimate: of a camera on a gimbal as estimated, of a fixed one with the mount as described."""
+    if isinstance(estimate.q_w_c, UnsetType):
+        return np.asarray(rot_from_quat(estimate.q_w_b) @ Mount.of(camera).r_b_c())
+    return rot_from_quat(estimate.q_w_c)

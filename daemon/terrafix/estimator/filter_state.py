@@ -118,6 +118,7 @@ class FilterState:
         # First node of the flight that a place stands behind: a start that is known, or a map match of its graph.
         self.first_placed_node: int | None = None
         self.start_moved = False  # the vehicle stood on what moves, and no map match has placed it since
+        self.on_gimbal = False  # the camera is held by a gimbal
         self.first_node = 0  # of the present graph, since the last reset
         self.last_fused_s = 0.0  # time of the newest frame with fused odometry or an accepted map match
         self.has_height = False

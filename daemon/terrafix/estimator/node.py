@@ -21,7 +21,7 @@ from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.time_offset import TimeOffset
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
-from terrafix.estimator.measurements.odometry import NO_NEW_VIEW
+from terrafix.estimator.measurements.odometry import NO_NEW_VIEW, without_ground
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.monitors.calibration_monitors import Monitors
 from terrafix.estimator.output import (
@@ -48,6 +48,7 @@ from terrafix.messages import (
     CovarianceMode,
     EkfDeadReckoning,
     Frame,
+    GimbalAttitude,
     Health,
     Imu,
     InitialPosition,
@@ -123,6 +124,7 @@ class EstimatorNode:
             InitialPosition: self._on_initial_position,
             VehicleState: self._on_vehicle_state,
             Imu: self._on_imu,
+            GimbalAttitude: self._on_gimbal,
             ServedVehicle: self._on_served_vehicle,
             CandidateAttitude: self._on_candidate_attitude,
             EkfDeadReckoning: self._on_dead_reckoning,
@@ -168,6 +170,7 @@ class EstimatorNode:
             return
         self._origin, self._monitors = origin, Monitors(origin)
         self._axes = LocalFrame(origin.lat_deg, origin.lon_deg)
+        self._telemetry.gimbal.describe(origin.camera)
         self._predicted_id = None  # in other axes
         prior = self._prior(origin, self._axes)
         offset = TimeOffset(Mount.of(origin.camera).r_b_c())
@@ -232,6 +235,10 @@ class EstimatorNode:
         self._telemetry.add_imu(imu)
         return ()
 
+    def _on_gimbal(self, attitude: GimbalAttitude) -> Iterable[Message]:
+        self._telemetry.gimbal.add(attitude)
+        return ()
+
     def _on_health(self, health: Health) -> Iterable[Message]:
         self._thermal = health
         return ()
@@ -290,6 +297,7 @@ class EstimatorNode:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
         estimator, frame = self._frame_input(self._estimator, odometry)
+        odometry = frame.odometry
         follows = not self._relocated and self._note_predicted_frame(estimator)
         self._relocated = False
         result = estimator.feed_frame(frame)
@@ -311,7 +319,8 @@ class EstimatorNode:
             orientation = estimator.state.orientation.fault
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
-            if estimator.state.orientation.suspects:  # turned or mirrored images move otherwise at any time
+            # Turned or mirrored images move otherwise at any time, and those of no ground as anything.
+            if estimator.state.orientation.suspects or not frame.attitude.sees_ground:
                 time_offset.forget_images()
             else:
                 time_offset.add(stamped, self._telemetry, agl_m)
@@ -353,6 +362,9 @@ class EstimatorNode:
             estimator = self._apply_initial_position(odometry.frame_id, odometry.t_ns, stands=attitude.stands)
         estimator.state.covariances.set_mode(self.mode)
         imu = self._ahrs.world_acceleration
+        if not attitude.sees_ground:
+            odometry = without_ground(odometry)
+        estimator.state.on_gimbal = self._telemetry.gimbal.used
         return estimator, FrameInput(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, imu)
 
     def _note_predicted_frame(self, estimator: Estimator) -> bool:

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
 from terrafix.core.map_error import shared_variance_m2
@@ -111,6 +112,7 @@ def estimate_of(
         velocity_enu_mps=(float(v[0]), float(v[1]), scale * float(v[UP])),
         velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(frame.velocity_cov)[-1])),  # of the worst direction
         q_w_b=quat_from_rot(state.body(frame)),
+        q_w_c=quat_from_rot(frame.pose.rotation().matrix()) if state.on_gimbal else UNSET,
         cov=tuple(float(c) for c in claim.cov.ravel()),
         map_sigma_m=estimator.map_sigma_m,
         source_label=_source(age_ms, tracked=tracked and connected) if state.is_placed else SourceLabel.NOT_PLACED,

@@ -41,6 +41,7 @@ COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # us
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 SEARCH = ROOT / "daemon" / "terrafix" / "anchor" / "place_index" / "faiss_ivf.py"  # the only file that imports FAISS
 SERVICE = ROOT / "daemon" / "terrafix" / "runtime" / "systemd.py"  # the only file that imports systemd-python
+ULOG = ROOT / "daemon" / "terrafix" / "core" / "autopilot_log" / "ulog.py"  # the only file that imports pyulog
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools", "terrafix_lab"}
 SOURCES = ("daemon", "engines", "tools")
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
@@ -48,12 +49,12 @@ LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 def imported(*folders: str, extras: bool = True) -> set[str]:
     """Top-level names of all third-party modules imported below the folders; with or without the code of the extras of
-    what flies: FAISS and systemd."""
+    what flies: FAISS, systemd and pyulog."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
         for path in (ROOT / folder).rglob("*.py"):
-            if not extras and path in (SEARCH, SERVICE):
+            if not extras and path in (SEARCH, SERVICE, ULOG):
                 continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Import):

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
+from terrafix.core.autopilot_log.dataflash import Table, read_dataflash
 from terrafix.core.errors import SourceError
 from terrafix.link.output.odometry import ARDUPILOT_M_PER_E7
-from terrafix_tools.autopilot_log.dataflash import Table, read_dataflash
 from terrafix_tools.autopilot_log.structure import (
-    Attitude,
     AutopilotLog,
     BodyRates,
     EkfTrack,
@@ -27,7 +27,6 @@ from terrafix_tools.autopilot_log.structure import (
     Series,
     Steps,
     changes,
-    cleaned,
     steps,
     value_at,
 )
@@ -138,8 +137,8 @@ def read_ardupilot(path: Path) -> AutopilotLog:
 _EMPTY = Table({}, {}, np.zeros(0, int), np.zeros(0))
 
 
-def _attitude(table: Table) -> Attitude:
-    return cleaned(Attitude(table.t_s, *(np.radians(table.column(name)) for name in ("Roll", "Pitch", "Yaw"))))
+def _attitude(table: Table) -> AttitudeSeries:
+    return cleaned(AttitudeSeries(table.t_s, *(np.radians(table.column(name)) for name in ("Roll", "Pitch", "Yaw"))))
 
 
 def _rates(found: dict[str, Table]) -> BodyRates | None:

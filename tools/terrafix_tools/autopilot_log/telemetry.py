@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
 from terrafix.core.errors import SourceError
 from terrafix.core.mavlink.tlog import TelemetryLog
 from terrafix.core.mavlink.vehicles import PX4, firmware_of
 from terrafix_tools.autopilot_log.ardupilot import mode_name, named_firmware
 from terrafix_tools.autopilot_log.structure import (
-    Attitude,
     AutopilotLog,
     BodyRates,
     EkfTrack,
@@ -28,7 +28,6 @@ from terrafix_tools.autopilot_log.structure import (
     GpsTrack,
     Origin,
     Series,
-    cleaned,
 )
 
 _WANTED = {
@@ -73,7 +72,7 @@ def read_telemetry(path: Path, system_id: int = 0) -> AutopilotLog:
         found[message.get_type()].append(((t_us - records.t0_us) * 1e-6, message))
     received = found["ATTITUDE"]
     t_s = _measured_s(received) if received else np.zeros(0)
-    attitude = cleaned(Attitude(t_s, *_columns(received, "roll", "pitch", "yaw")))
+    attitude = cleaned(AttitudeSeries(t_s, *_columns(received, "roll", "pitch", "yaw")))
     if not attitude.t_s.size:
         raise SourceError(f"{path}: holds no attitude of an autopilot (ATTITUDE); give another log")
     firmware = _firmware(found["HEARTBEAT"], found["STATUSTEXT"])

@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import UnsetType
 
-from terrafix.core.camera import CameraCalibration, Mount
+from terrafix.core.camera import CameraCalibration, Mount, camera_rotation
 from terrafix.core.errors import SourceError, UsageError
-from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.filter_state import focal_scale
 from terrafix.estimator.measurements.attitude_height import body_sigma_rad
@@ -137,7 +138,7 @@ class _Cameras:
         """Camera of the body in ``estimate``, without file and ground plane."""
         mount, cov = Mount.of(self._camera), np.array(estimate.cov).reshape(6, 6)
         calibration = CameraCalibration.of(self._camera)
-        r_w_c = rot_from_quat(estimate.q_w_b) @ mount.r_b_c()
+        r_w_c = camera_rotation(estimate, self._camera)
         shift_m, height_m = np.zeros(2), estimate.agl_m
         learnt = self._nearest(estimate.t_ns)
         if learnt is None:
@@ -145,7 +146,8 @@ class _Cameras:
         else:
             # The camera is known better than the body in it, and the estimate has the covariance of the body.
             cov[WORLD_TILT, WORLD_TILT] -= self._body_sigma_rad**2 * np.eye(2)
-            r_w_c = r_w_c @ exp_so3(np.append(learnt.state[MOUNT_TILT], 0.0))
+            if isinstance(estimate.q_w_c, UnsetType):  # else it has the tilt
+                r_w_c = r_w_c @ exp_so3(np.append(learnt.state[MOUNT_TILT], 0.0))
             calibration = replace(calibration, radial_k1=learnt.state[RADIAL_K1])
             height_m /= focal_scale(self._camera, learnt.state[LOG_HEIGHT_SCALE])
             # The published position has the estimated principal point in it. The same offset turns the rays the other

@@ -7,23 +7,26 @@ import difflib
 import math
 import re
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from terrafix.core.errors import SourceError
 from terrafix.core.toml_file import read_toml
-from terrafix.messages import Camera, Origin
+from terrafix.messages import Camera, Gimbal, Origin, VehicleState
 from terrafix.vision.sources.plausible import check_camera, check_centre
 
 if TYPE_CHECKING:
+    from terrafix.core.autopilot_log.own_log import OwnLog
     from terrafix.core.mavlink.tlog import TelemetryLog
 
 START_SIGMA_M = 10.0  # a coordinate from a map or a phone before take-off
 YAW_SIGMA_DEG = 5.0  # compass of a small multirotor near its motors
 AGL_SIGMA_M = 5.0  # barometer drift over a flight, and terrain relief relative to the take-off point
+LOG_SUFFIXES = (".tlog", ".bin", ".BIN", ".log", ".ulg")  # of logs beside a flight: of a ground station, ArduPilot, PX4
 ATTITUDE_SIGMA_DEG = 2.0  # EKF attitude under acceleration
 # Relative 1-sigma of the focal length: calibrated (a calibration also gives distortion), and nominal. A wide-angle lens
 # that was described by its field of view as a pinhole was 30 % off in a public data set.
@@ -71,6 +74,9 @@ class MountTable(_Table, frozen=True, kw_only=True):
     pitch_deg: Degrees = -90.0
     roll_deg: Degrees = 0.0
     tolerance_deg: Annotated[float, Meta(gt=0, le=90)] = 5.0
+    gimbal: Literal["mavlink", "auto", "none"] | None = None  # None: "auto" where the file has no [mount]
+    gimbal_device: Annotated[int, Meta(ge=0, le=255)] = 0  # gimbal_device_id or component id; 0: the first heard
+    stabilised: tuple[Literal["roll", "pitch"], ...] = ("roll", "pitch")
 
 
 class StartTable(_Table, frozen=True, kw_only=True):
@@ -86,6 +92,7 @@ class TelemetryTable(_Table, frozen=True, kw_only=True):
     agl_sigma_m: Positive = AGL_SIGMA_M
     attitude_sigma_deg: Positive = ATTITUDE_SIGMA_DEG
     tlog_t0_us: int | None = None  # UNIX microseconds of t_s = 0; absent: time of the first record of the log
+    log_zero_s: float | None = None  # t_s = 0 on the clock of the autopilot's own log; absent: by the attitudes
     system_id: Annotated[int, Meta(ge=0, le=255)] = 0  # vehicle of the log; 0: the only one, or the only one that moves
 
 
@@ -100,7 +107,7 @@ class Description(_Table, frozen=True, kw_only=True):
     license: str = ""
     map: str = ""
     camera: CameraTable | None = None
-    mount: MountTable = MountTable()
+    mount: MountTable = MountTable(gimbal="auto")
     start: StartTable | None = None
     telemetry: TelemetryTable = TelemetryTable()
     truth: dict[str, Any] = {}
@@ -151,9 +158,18 @@ def camera_of(path: Path, description: Description) -> Camera:
         mount_pitch_deg=m.pitch_deg,
         mount_roll_deg=m.roll_deg,
         mount_tolerance_deg=m.tolerance_deg,
+        gimbal=_gimbal(m),
     )
     check_camera(path, camera)
     return camera
+
+
+def _gimbal(mount: MountTable) -> Gimbal | UnsetType:
+    if mount.gimbal in (None, "none"):
+        return UNSET
+    return Gimbal(
+        required=mount.gimbal == "mavlink", device=mount.gimbal_device, stabilised=tuple(sorted(set(mount.stabilised)))
+    )
 
 
 def origin_of(description: Description, camera: Camera, start: tuple[float, float] | None) -> Origin:
@@ -183,11 +199,25 @@ def origin_of(description: Description, camera: Camera, start: tuple[float, floa
     )
 
 
-def telemetry_log(path: Path, description: Description) -> "TelemetryLog":
-    """The log of a flight, with the zero and the vehicle that its description states. Raises SourceError."""
-    from terrafix.core.mavlink.tlog import TelemetryLog  # the console reads descriptions and no telemetry
+def telemetry_log(
+    stem: Path, description: Description, states: Sequence[VehicleState] = ()
+) -> "TelemetryLog | OwnLog | None":
+    """The log beside a flight: ``stem`` with one of LOG_SUFFIXES; None: there is none. Zero and vehicle are those that
+    the description states; ``states``: of the frames, by which the clock of an autopilot's own log is aligned.
 
-    return TelemetryLog(path, description.telemetry.tlog_t0_us, description.telemetry.system_id)
+    Raises SourceError: it cannot be used, or there are several."""
+    found = [stem.with_suffix(suffix) for suffix in LOG_SUFFIXES if stem.with_suffix(suffix).is_file()]
+    if len(found) > 1:
+        raise SourceError(f"{found[0]}: {found[1].name} lies beside it; keep one log of the flight")
+    if not found:
+        return None
+    if found[0].suffix == ".tlog":
+        from terrafix.core.mavlink.tlog import TelemetryLog  # the console reads descriptions and no telemetry
+
+        return TelemetryLog(found[0], description.telemetry.tlog_t0_us, description.telemetry.system_id)
+    from terrafix.core.autopilot_log.own_log import OwnLog
+
+    return OwnLog(found[0], description.telemetry.log_zero_s, states)
 
 
 def _check_numbers(path: Path, table: dict[str, Any], where: str = "") -> None:

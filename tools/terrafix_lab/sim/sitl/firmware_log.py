@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafix.core.autopilot_log.dataflash import Table, read_dataflash
 from terrafix.link.gnss.source_switch import AUTO_SWITCH, PRIMARY
 from terrafix.link.integrity.output_predictor import distance_m
 from terrafix_lab.sim.sitl.report import FIX_3D
 from terrafix_tools.autopilot_log.ardupilot import ARMED, DISARMED
-from terrafix_tools.autopilot_log.dataflash import Table, read_dataflash
 from terrafix_tools.score import longest_gap_s
 
 POSITION_SOURCE = (AUTO_SWITCH, PRIMARY)  # what `link.gnss = "act"` sets

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from terrafix.core.camera import CameraCalibration, Mount
+from terrafix.core.camera import CameraCalibration, camera_rotation
 from terrafix.core.gate import SIGMAS_95
-from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, NavEstimate, PositionHint
 from terrafix_tools.console.payloads import Hint, UserFix
 
@@ -35,7 +35,7 @@ def fix_message(
     if seen is None:
         return None
     frame = LocalFrame(fix.lat, fix.lon)
-    r_w_c = rot_from_quat(seen.q_w_b) @ Mount.of(camera).r_b_c()
+    r_w_c = camera_rotation(seen, camera)
     x, y = CameraCalibration.of(camera).normalise(np.array([pixel]))[0]
     ray = r_w_c @ np.array([x, y, 1.0])
     ray /= np.linalg.norm(ray)
