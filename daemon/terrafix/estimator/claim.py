@@ -23,9 +23,16 @@ class Claim:
     terms_m2: dict[str, float]
 
 
-def claim(estimator: Estimator, frame: FrameState, time_offset_sigma_s: float, calibration_sigma_m: float) -> Claim:
+def claim(
+    estimator: Estimator,
+    frame: FrameState,
+    time_offset_sigma_s: float,
+    calibration_sigma_m: float,
+    path_error_m: float = 0.0,
+) -> Claim:
     """Claim of ``frame``, the newest one. ``time_offset_sigma_s``: 1-sigma of the camera against telemetry;
-    ``calibration_sigma_m``: 1-sigma of the position by a description that monitors have found wrong."""
+    ``calibration_sigma_m``: 1-sigma of the position by a description that monitors have found wrong; ``path_error_m``:
+    its error by one that none has named."""
     state = estimator.state
     budget = _Budget(state.covariances.widening**2 * tangent_to_world(frame.cov, frame.pose.rotation().matrix()))
     cov = budget.cov
@@ -41,7 +48,7 @@ def claim(estimator: Estimator, frame: FrameState, time_offset_sigma_s: float, c
     v = frame.velocity_mps
     cov[WORLD_POSITION, WORLD_POSITION] += time_offset_sigma_s**2 * np.outer(v, v)
     budget.close("time_offset")
-    other_m, budget.cov = estimator.hypotheses.claim(cov)
+    other_m, budget.cov = estimator.hypotheses.claim(cov, path_error_m)
     cov = budget.cov
     budget.close("hypotheses")
     cov[HORIZONTAL, HORIZONTAL] += calibration_sigma_m**2 * np.eye(2)

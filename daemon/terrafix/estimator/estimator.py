@@ -33,8 +33,8 @@ class Estimator:
     def feed_frame(self, frame: FrameInput) -> PropagationResult:
         """A new node. -> the predicted camera and the verdicts on what was measured."""
         result = self._propagation.advance(frame)
-        if self.hypotheses.other.probability > 0.0:  # for the refinement, which cannot tell right from wrong either
-            self._ambiguous[frame.frame_id] = self.hypotheses.other.inflation_m2()
+        if self.hypotheses.other.weight > 0.0:  # for the refinement, which cannot tell right from wrong either
+            self._ambiguous[frame.frame_id] = self.hypotheses.other.moments_m2()
         return result
 
     def feed_map_match(self, match: MapMatch) -> MapResult:

@@ -202,6 +202,7 @@ class EstimatorNode:
         """``time_offset``: of the camera, so far."""
         assert self._axes is not None and self._monitors is not None
         self._estimator = estimator
+        estimator.hypotheses.use(self._monitors.agreement)
         self._flight = EstimatedFlight(estimator, self._axes, time_offset, self._monitors, self._telemetry)
         return estimator
 
