@@ -1,12 +1,12 @@
 """Agreement of a position with the map: one posterior over what may be wrong with the position.
 
 Each cause is compared with "the position is right" by its log odds [nats]; together they are normalised, so that the
-probabilities of all causes and of "right" sum to one. ``NATS`` is the table of likelihoods: what was observed, and the
-log likelihood ratio of each cause over "right" for one unit of new ground. The anchor decides by it whether it searches,
-the estimator how wide its claim is.
+probabilities of all causes and of "right" sum to one. ``NATS`` is the table of likelihoods: what was observed, and
+the log likelihood ratio of each cause over "right" for one unit of new ground. The anchor decides by it whether it
+searches, the estimator how wide its claim is.
 
-Not a cause: images of another camera or an old buffer. They are refused before the map (estimator/integrity/fragments.py,
-motion_gate.py)."""
+Not a cause: images of another camera or an old buffer. They are refused before the map
+(estimator/integrity/fragments.py, motion_gate.py)."""
 
 import math
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ class Observed(Enum):
     NOTHING = "textured ground on which no pose was found or fused"
 
 
-# Probability of a lone rejected pose: of a right position, up to a tenth on a map of another year, and over other ground,
-# where poses are wherever patterns look alike. [measured: docs/integrity.md]
+# Probability of a lone rejected pose: of a right position, up to a tenth on a map of another year, and over other
+# ground, where poses are wherever patterns look alike. [measured: docs/integrity.md]
 P_REJECTED, P_REJECTED_OTHER_GROUND = 0.1, 0.9
 # Probability that a correlation over textured ground finds nothing. With a focal length doubled, a heading 90 and 180
 # degrees off or a camera mounted sideways, one pose entered the graph in 450 correlations of five simulated flights.

@@ -1,4 +1,5 @@
-"""Lock monitor: whether the tracked position is right or the vehicle elsewhere (core/agreement.py), over frames and poses.
+"""Lock monitor: whether the tracked position is right or the vehicle elsewhere (core/agreement.py), over frames and
+poses.
 
 A belief always has a best position, and a wrong one can score well in single frames. Over many frames the evidence for
 the belief as a whole is lower at a wrong position, and no camera pose is found.

@@ -11,6 +11,7 @@ import numpy as np
 from terrafix.core.agreement import Agreement, Cause
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.core.pose import positive_part
 from terrafix.estimator.integrity.alternative_position import AlternativePosition
 from terrafix.estimator.integrity.other_ground import OtherGround
 from terrafix.messages import BeliefSummary, Origin, SearchResult, Verdict
@@ -150,5 +151,4 @@ class PositionHypotheses:
 
     def _propagated(self, component: Component, estimate_m2: np.ndarray) -> Component:
         """``component``, from an earlier frame, widened by the growth of the estimate's covariance since then."""
-        values, axes = np.linalg.eigh(estimate_m2 - self._estimate_cov_m2)
-        return replace(component, cov_m2=component.cov_m2 + (axes * np.maximum(values, 0.0)) @ axes.T)
+        return replace(component, cov_m2=component.cov_m2 + positive_part(estimate_m2 - self._estimate_cov_m2))
