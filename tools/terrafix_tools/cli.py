@@ -98,7 +98,7 @@ class _Commands(typer.core.TyperGroup):
         return [name for names in GROUPS.values() for name in names if name in installed]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        command = _load(cmd_name) if cmd_name in MODULES else super().get_command(ctx, cmd_name)
+        command: Any = _load(cmd_name) if cmd_name in MODULES else super().get_command(ctx, cmd_name)
         if command is not None:
             command.rich_help_panel = next((group for group, names in GROUPS.items() if cmd_name in names), None)
             _show_brackets(command)

@@ -146,6 +146,7 @@ def test_the_version_is_the_same_in_code_metadata_and_changelog() -> None:
     assert metadata.version("terrafix") == version
     newest = re.search(r"^## \[([^\]]+)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.M)
     assert newest is not None and newest[1] == version
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_the_licence_file_matches_the_declared_licence() -> None:
