@@ -229,7 +229,7 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
     assert not (unpacked / "terrafix_engines" / "train").exists()
     shown = in_wheel(unpacked, "--help")
     commands = [line.split()[1] for line in shown.stdout.splitlines() if re.match(r"│ [a-z]", line)]
-    at_it = "run replay evaluate report preflight status hint log source files models map"
+    at_it = "run status hint preflight source files models replay report evaluate log map"
     assert commands == at_it.split(), shown.stderr
     status = in_wheel(unpacked, "status", "--run", "nowhere")
     assert status.returncode == 2 and status.stderr.startswith("terrafix: nowhere: no such folder; omit --run")
