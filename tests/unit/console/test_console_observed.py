@@ -28,7 +28,7 @@ from terrafix_tools.console.events import (
 from terrafix_tools.console.payloads import FlightState, FragmentState
 
 
-class Flight:
+class ObservedFlight:
     """A flight, frame by frame."""
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ LOST, WIDEN, WHOLE, ASK = m.Verdict.LOST, m.SearchStep.WIDEN, m.SearchStep.WHOLE
 
 
 def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     outcome = flight.frame(m.Verdict.ACCEPTED)
     result = outcome.result
     assert result is not None and result.gps is not None and result.ellipse is not None
@@ -83,7 +83,7 @@ def test_the_confidence_is_that_of_the_worse_axis() -> None:
 
 
 def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.frame(m.Verdict.ACCEPTED)
     flight.searches(1)
     lost = flight.frame(LOST, WIDEN)
@@ -122,7 +122,7 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
 
 
 def test_a_flight_that_is_lost_when_its_images_are_through_asks_once() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     for step in (WIDEN, WHOLE):
         flight.frame(LOST, step)
         assert flight.observer.images_through() is None  # two frames are no lost flight
@@ -139,7 +139,7 @@ def test_a_flight_that_is_lost_when_its_images_are_through_asks_once() -> None:
 
 
 def test_a_fragment_that_begins_joined_is_merged_with_its_first_frame() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
     outcome = flight.frame(m.Verdict.UNCONFIRMED, fragment=1, joined=True)
     assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=1, frames=1)]
@@ -147,7 +147,7 @@ def test_a_fragment_that_begins_joined_is_merged_with_its_first_frame() -> None:
 
 
 def test_a_fragment_is_unanchored_then_matching_then_anchored_or_merged() -> None:
-    flight, states = Flight(), []
+    flight, states = ObservedFlight(), []
     steps = [(m.Verdict.UNCONFIRMED, m.SearchStep.NORMAL), (LOST, WIDEN), (m.Verdict.ACCEPTED, m.SearchStep.NORMAL)]
     for verdict, step in (*steps, (LOST, WHOLE)):
         outcome = flight.frame(verdict, step, joined=False)
@@ -164,7 +164,7 @@ def test_a_fragment_is_unanchored_then_matching_then_anchored_or_merged() -> Non
 
 
 def test_a_search_is_a_recovery_that_starts_and_succeeds_once() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.frame(m.Verdict.ACCEPTED)
     (started,) = of_kind(flight.frame(LOST, WIDEN), RecoveryStarted)
     assert started == RecoveryStarted(frame_id=1)
@@ -175,7 +175,7 @@ def test_a_search_is_a_recovery_that_starts_and_succeeds_once() -> None:
 
 @pytest.mark.parametrize(("verdict", "kind"), [("accepted", UserFixApplied), ("innovation", VerdictGiven)])
 def test_a_user_fix_is_applied_or_refused_with_the_reason(verdict: str, kind: type[Event]) -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.observer.take(
         [m.MeasurementVerdict(t_ns=0, frame_id=0, measurement="user_fix", verdict=m.Verdict(verdict), detail="why")]
     )
@@ -184,7 +184,7 @@ def test_a_user_fix_is_applied_or_refused_with_the_reason(verdict: str, kind: ty
 
 
 def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.frame(LOST, ASK)
     rejected = m.HintVerdict(
         t_ns=0, hint_t_ns=1, verdict=m.Verdict.OUTSIDE_MAP, distance_m=None, sigma_m=None, text="outside"
@@ -197,7 +197,7 @@ def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> No
 
 
 def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
     flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=False)
     outcome = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
@@ -214,7 +214,7 @@ def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
 
 
 def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.observer.hints[77] = 3
     flight.observer.take(
         [
@@ -262,7 +262,7 @@ def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> 
 
 
 def test_an_image_without_position_has_a_result_with_its_error() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.observer.take([msgspec.structs.replace(frame(0), error="file is empty")])
     outcome = flight.observer.frame_done()
     assert outcome.result is not None

@@ -172,7 +172,7 @@ def _smoothed(
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedCamera:
     """A camera with the covariance of its pose (6, 6), tangent order, and its calibration state."""
 
     pose: gtsam.Pose3
@@ -180,14 +180,14 @@ class Placed:
     bias: np.ndarray
 
 
-def solved_track(flight: FlightGraph, found: Smoothed) -> dict[int, Placed]:
+def solved_track(flight: FlightGraph, found: Smoothed) -> dict[int, PlacedCamera]:
     """By frame: the batch solution."""
-    return {i: Placed(found.poses[n], found.covs[n], found.bias[n]) for i, n in flight.node_of.items()}
+    return {i: PlacedCamera(found.poses[n], found.covs[n], found.bias[n]) for i, n in flight.node_of.items()}
 
 
-def heights_as_seen(flight: FlightGraph, track: dict[int, Placed]) -> dict[int, Placed]:
+def heights_as_seen(flight: FlightGraph, track: dict[int, PlacedCamera]) -> dict[int, PlacedCamera]:
     """The covariance with what the description leaves open of the focal length: heights are as seen through it."""
-    seen, camera = dict[int, Placed](), flight.origin.camera
+    seen, camera = dict[int, PlacedCamera](), flight.origin.camera
     for frame_id, at in track.items():
         up = at.pose.rotation().matrix()[UP]
         height_m = float(at.pose.translation()[UP]) - (flight.origin.ground_amsl_m or 0.0)
@@ -197,7 +197,7 @@ def heights_as_seen(flight: FlightGraph, track: dict[int, Placed]) -> dict[int, 
     return seen
 
 
-def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, Placed]:
+def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, PlacedCamera]:
     """By frame: the positions that the estimator refines after landing, as in estimates.csv, with its orientations."""
     map_cov = np.diag([shared_variance_m2(estimator.map_sigma_m)] * 2 + [0.0] * 4)
     placed = {}
@@ -206,7 +206,7 @@ def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, Placed
             continue
         pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(past.r_w_c), past.p_m)
         cov = world_to_tangent(past.cov + map_cov, past.r_w_c)
-        placed[frame_id] = Placed(pose, cov, flight.recorder.nodes[node].state.calibration)
+        placed[frame_id] = PlacedCamera(pose, cov, flight.recorder.nodes[node].state.calibration)
     return placed
 
 
@@ -221,7 +221,7 @@ def m_per_unit(flight: FlightGraph, found: Smoothed) -> dict[int, float]:
     return {begin: float(solved_m / flown) for begin, (solved_m, flown) in lengths.items() if flown > 0.0}
 
 
-def _fill(row: FinalRow, placed: Placed, frame: LocalFrame, r_b_c: np.ndarray) -> None:
+def _fill(row: FinalRow, placed: PlacedCamera, frame: LocalFrame, r_b_c: np.ndarray) -> None:
     r_w_c, p = placed.pose.rotation().matrix(), placed.pose.translation()
     cov = tangent_to_world(placed.cov, r_w_c)
     tilt = exp_so3(np.array([*placed.bias[MOUNT_TILT], 0.0]))

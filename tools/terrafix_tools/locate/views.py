@@ -132,7 +132,7 @@ def read_views(record: Path) -> FlightViews:
         views[frame_id] = cameras.at(views[frame_id], refined[frame_id])
     folder = record if record.is_dir() else record.parent
     by_time = {round(view.t_ns * 1e-9, 3): frame_id for frame_id, view in views.items()}
-    lens = Lens.of(read_flights(folder / SUMMARY), origin.camera)
+    lens = SolvedLens.of(read_flights(folder / SUMMARY), origin.camera)
     for row in read_poses(folder):
         if (finalised := by_time.get(round(row.t_s, 3))) is not None:
             view = cameras.at(views[finalised], row.pose(finalised))
@@ -141,14 +141,14 @@ def read_views(record: Path) -> FlightViews:
 
 
 @dataclass(frozen=True)
-class Lens:
+class SolvedLens:
     """Of a batch solution: focal length over the described one, and radial coefficient."""
 
     focal_ratio: float
     radial_k1: float
 
     @classmethod
-    def of(cls, flights: list[dict[str, Any]], camera: Camera) -> "Lens | None":
+    def of(cls, flights: list[dict[str, Any]], camera: Camera) -> "SolvedLens | None":
         """``flights``: of finalised.json. None: no batch solution was kept, and heights are as seen through the
         described lens."""
         if len(flights) != 1 or flights[0].get("solution") != FINALISED:
