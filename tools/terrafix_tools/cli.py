@@ -29,7 +29,7 @@ EXTRAS = {
         "fastapi", "starlette", "uvicorn", "sqlalchemy", "python_multipart", "pydantic",
         "terrafix_tools.console",
     ),
-    "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "terrafix_"),
+    "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "yaml", "terrafix_"),
 }  # fmt: skip
 # a full disk, or one over its quota
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
@@ -42,6 +42,7 @@ MODULES = {
     "hint": "terrafix_tools.hint.cli:hint",
     "log": "terrafix_tools.log.cli:app",
     "source": "terrafix_tools.source.cli:app",
+    "camera": "terrafix_tools.camera.cli:app",
     "files": "terrafix_tools.files.cli:files",
     "models": "terrafix_tools.models.cli:app",
     "map": "terrafix_tools.mapping.cli:app",
