@@ -63,7 +63,7 @@ MODULES = {
 # Of the help, in the order of a flight. A command that is in none is a mistake (tests/unit/project/test_cli_help.py).
 GROUPS = {
     "Fly": ("run", "status", "hint"),
-    "Before a flight": ("preflight", "source", "files", "models"),
+    "Before a flight": ("preflight", "camera", "source", "files", "models"),
     "After a flight": ("replay", "report", "evaluate", "finalise", "log", "compare", "locate", "fleet"),
     "Photos and flights over HTTP": ("serve", "flight"),
     "Maps": ("map",),
