@@ -131,6 +131,7 @@ PROCESSES: tuple[Process, ...] = (
             m.ServedVehicle,
             m.CandidateAttitude,
             m.EkfDeadReckoning,
+            m.PositionHint,
             m.Odometry,
             m.Relocalization,
             m.MapMatch,

@@ -16,10 +16,10 @@ from terrafix_tools.autopilot_log.structure import (
     AutopilotLog,
     BodyRates,
     EkfTrack,
-    Event,
     Fusion,
     GlobalTrack,
     GpsTrack,
+    LogEvent,
     Origin,
     Series,
     Steps,
@@ -111,7 +111,7 @@ def read_px4(path: Path) -> AutopilotLog:
     primary = None if selector is None else steps(_t_s(selector), _integers(selector, "primary_instance"))
     gps = _receivers(topics)
     status = _first(topics, "vehicle_status")
-    texts = [Event(t_s, "message", text) for t_s, text in read.texts]
+    texts = [LogEvent(t_s, "message", text) for t_s, text in read.texts]
     return AutopilotLog(
         path=path,
         kind="PX4 ULog",
@@ -240,18 +240,20 @@ def _size(topic: Topic) -> int:
     return len(topic["timestamp"])
 
 
-def _states(status: Topic | None) -> list[Event]:
+def _states(status: Topic | None) -> list[LogEvent]:
     if status is None:
         return []
     events = []
     modes = steps(_t_s(status), _integers(status, "nav_state"))
     if modes is not None:
         events += [
-            Event(float(t), "mode", _MODES.get(int(n), f"mode {int(n)}"))
+            LogEvent(float(t), "mode", _MODES.get(int(n), f"mode {int(n)}"))
             for t, n in zip(modes.t_s, modes.value, strict=True)
         ]
     armed = steps(_t_s(status), (_integers(status, "arming_state") == _ARMED).astype(float))
     if armed is not None:
         changed = zip(armed.t_s, armed.value, strict=True)
-        events += [Event(float(t), "arming", "armed" if n else "disarmed") for t, n in changed if n or t > armed.t_s[0]]
+        events += [
+            LogEvent(float(t), "arming", "armed" if n else "disarmed") for t, n in changed if n or t > armed.t_s[0]
+        ]
     return events

@@ -41,11 +41,12 @@ class FlightFolder:
         check_heights(folder / "frames.csv", heights_m)
         self._check_files()
         self._check_size()
-        stated = [row.state for row in self._rows if row.state is not None]
+        stated, self._stated_in = [row.state for row in self._rows if row.state is not None], "frames.csv"
         table = folder / "telemetry.csv"
         if table.is_file():
             stated += [row.state for row in read_table(table, table.name, with_file=False) if row.state is not None]
             stated.sort(key=lambda state: state.t_ns)
+            self._stated_in += f" and {table.name}"
         self._stated = stated
         self._log = telemetry_log(folder / "telemetry", self._description, stated)
         self._states = self._telemetry()
@@ -73,7 +74,7 @@ class FlightFolder:
             *rate_facts(times_s, "frames"),
         ]
         if self._stated or self._log is None:
-            found += telemetry_facts(self._stated, "frames.csv and telemetry.csv")
+            found += telemetry_facts(self._stated, self._stated_in)
         if self._log is not None:
             found += telemetry_facts(self._log.states, self._log.path.name)
             found += log_facts(self._log)
