@@ -12,6 +12,7 @@ from terrafix.messages import Frame, GimbalAttitude, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
 from terrafix.vision.sources.facts import Fact, camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
+from terrafix.vision.sources.srt import read_srt
 from terrafix.vision.sources.table import read_table
 
 FFMPEG_QUIET = "-8"  # AV_LOG_QUIET; a damaged image would otherwise print one line per block
@@ -135,6 +136,9 @@ class Video:
         if table.is_file():
             rows = read_table(table, table.name, with_file=False)
             states += [row.state for row in rows if row.state is not None]
+        for subtitles in (self.path.with_suffix(".SRT"), self.path.with_suffix(".srt")):
+            if subtitles.is_file() and not states:  # a table beside it was made on purpose
+                states += read_srt(subtitles)
         return states
 
     def _open(self) -> cv2.VideoCapture:
