@@ -24,7 +24,7 @@ from terrafix_tools.console.events import (
 from terrafix_tools.console.payloads import FlightState
 
 
-class Flight:
+class ObservedFlight:
     """A flight, frame by frame."""
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ LOST, WIDEN, WHOLE, ASK = m.Verdict.LOST, m.SearchStep.WIDEN, m.SearchStep.WHOLE
 
 
 def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     outcome = flight.frame(m.Verdict.ACCEPTED)
     result = outcome.result
     assert result is not None and result.gps is not None and result.ellipse is not None
@@ -79,7 +79,7 @@ def test_the_confidence_is_that_of_the_worse_axis() -> None:
 
 
 def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.frame(m.Verdict.ACCEPTED)
     flight.searches(1)
     lost = flight.frame(LOST, WIDEN)
@@ -118,7 +118,7 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
 
 
 def test_a_flight_that_is_lost_when_its_images_are_through_asks_once() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     for step in (WIDEN, WHOLE):
         flight.frame(LOST, step)
         assert flight.observer.images_through() is None  # two frames are no lost flight
@@ -135,7 +135,7 @@ def test_a_flight_that_is_lost_when_its_images_are_through_asks_once() -> None:
 
 
 def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.frame(LOST, ASK)
     rejected = m.HintVerdict(
         t_ns=0, hint_t_ns=1, verdict=m.Verdict.OUTSIDE_MAP, distance_m=None, sigma_m=None, text="outside"
@@ -148,7 +148,7 @@ def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> No
 
 
 def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
     flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=False)
     outcome = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
@@ -165,7 +165,7 @@ def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
 
 
 def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.observer.hints[77] = 3
     flight.observer.take(
         [
@@ -202,7 +202,7 @@ def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> 
 
 
 def test_an_image_without_position_has_a_result_with_its_error() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.observer.take([msgspec.structs.replace(frame(0), error="file is empty")])
     outcome = flight.observer.frame_done()
     assert outcome.result is not None

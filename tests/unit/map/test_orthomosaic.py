@@ -25,9 +25,9 @@ from terrafix_tools.cli import app
 from terrafix_tools.locate.locator import FlightLocator
 from terrafix_tools.locate.views import CameraView, read_views
 from terrafix_tools.mapping.area.build import with_statement
-from terrafix_tools.mapping.orthomosaic.composite import Composite, Grid, grid_around
+from terrafix_tools.mapping.orthomosaic.composite import Composite, OrthomosaicGrid, grid_around
 from terrafix_tools.mapping.orthomosaic.frames import refined_views, spread
-from terrafix_tools.mapping.orthomosaic.make import Request, make
+from terrafix_tools.mapping.orthomosaic.make import OrthomosaicRequest, make
 from terrafix_tools.mapping.orthomosaic.write import read_statement
 from terrafix_tools.mapping.sources.spec import SourceSpec
 
@@ -71,7 +71,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def mosaic(flight: Path) -> Path:
     with rasterio.Env(GDAL_CACHEMAX=100_000):  # bytes: GDAL writes at once what it would keep of a large file
-        make(Request(flight, flight / "mosaic.tif", gsd_m=0.5, flown_by="crew 7"))
+        make(OrthomosaicRequest(flight, flight / "mosaic.tif", gsd_m=0.5, flown_by="crew 7"))
     return flight / "mosaic.tif"
 
 
@@ -119,7 +119,7 @@ def test_accuracy_is_that_of_located_pixels(mosaic: Path, flight: Path) -> None:
 
 
 def test_steepest_frame_is_shown() -> None:
-    grid = Grid(local_crs(48.0, 11.0), -100.0, 20.0, 1.0, 300, 40)
+    grid = OrthomosaicGrid(local_crs(48.0, 11.0), -100.0, 20.0, 1.0, 300, 40)
     made = Composite(grid, ORIGIN, None)
     views = {i: view_of(i) for i in range(FRAMES)}
     for i in (2, 0, 3, 1):
@@ -131,7 +131,7 @@ def test_steepest_frame_is_shown() -> None:
 
 def test_relief_moves_what_a_frame_shows_to_its_place() -> None:
     """A plateau 20 m high fills the view: the same pixels are seen on ground that is nearer."""
-    grid = Grid(local_crs(48.0, 11.0), -40.0, 40.0, 1.0, 80, 80)
+    grid = OrthomosaicGrid(local_crs(48.0, 11.0), -40.0, 40.0, 1.0, 80, 80)
     made = Composite(grid, ORIGIN, lambda e_m, _n_m: np.full(e_m.shape, rig.START_AMSL_M + 20.0))
     made.add(view_of(0), image(0))
     east_m, north_m = np.array([24.5]), np.array([-15.5])  # a fifth nearer: 1.25 times as far on the level ground
@@ -140,7 +140,7 @@ def test_relief_moves_what_a_frame_shows_to_its_place() -> None:
 
 
 def test_frame_outside_the_raster_draws_nothing() -> None:
-    made = Composite(Grid(local_crs(48.0, 11.0), 5000.0, 6000.0, 1.0, 50, 50), ORIGIN, None)
+    made = Composite(OrthomosaicGrid(local_crs(48.0, 11.0), 5000.0, 6000.0, 1.0, 50, 50), ORIGIN, None)
     made.add(view_of(0), image(0))
     assert not made.valid.any()
 
@@ -255,10 +255,10 @@ def test_frames_of_the_source_are_taken_where_the_record_has_none(tmp_path: Path
     run.mkdir()
     write_flight(run, images=False)
     with pytest.raises(SourceError, match="names no source; give its flight with --frames"):
-        make(Request(run, tmp_path / "m.tif"))
-    given = make(Request(run, tmp_path / "a.tif", frames=source, gsd_m=1.0))
+        make(OrthomosaicRequest(run, tmp_path / "m.tif"))
+    given = make(OrthomosaicRequest(run, tmp_path / "a.tif", frames=source, gsd_m=1.0))
     (run / "summary.json").write_text(json.dumps({"source": str(source)}))
-    named = make(Request(run, tmp_path / "b.tif", gsd_m=1.0))
+    named = make(OrthomosaicRequest(run, tmp_path / "b.tif", gsd_m=1.0))
     assert given.frames == named.frames == FRAMES and given.statement.date == ""
 
 
@@ -276,4 +276,4 @@ def test_wrong_requests_are_named(
 ) -> None:
     options: dict[str, object] = {"out": tmp_path / "m.tif", **changed}
     with pytest.raises(error, match=words):
-        make(Request(flight, **options))  # type: ignore[arg-type]
+        make(OrthomosaicRequest(flight, **options))  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.sources.description import camera_of, read_description
 from terrafix.vision.sources.table import Row, read_table
-from terrafix_lab.chaos.scene import LEAD_S, STRAIGHT_RADPS, Scene, middle_of_longest
+from terrafix_lab.chaos.scene import LEAD_S, STRAIGHT_RADPS, ChaosScene, middle_of_longest
 from terrafix_lab.faults.fault import Phase
 from terrafix_lab.sim.autopilot.course import Course, PeerState, read_course, write_course
 from terrafix_tools.evaluate import Truth, read_truth, truth_sigma_of
@@ -24,7 +24,7 @@ AFTER_S = 25.0  # of the flight that must be left after a fault
 ATTITUDE_SIGMA_DEG = 5.0  # of roll and pitch where none were recorded: the course is level [measured: docs/faults.md]
 
 
-def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> Scene:
+def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> ChaosScene:
     """``flight``: folder with flight.toml, frames.csv, JPEG frames and truth.csv; ``map_path``: None for the one that
     it names. Its course is written into ``folder``. Raises SourceError, EvaluationError, MapError, OutputError."""
     description = read_description(flight / "flight.toml")
@@ -44,7 +44,7 @@ def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> Scene:
     write_course(course_csv, zip(times_s.tolist(), states, strict=True))
     course = read_course(course_csv)
     has_attitude = all(row.state is not None and row.state.roll_rad is not None for row in rows)
-    return Scene(
+    return ChaosScene(
         map_path=package_of(map_path or (flight / description.map).resolve(), progress=True),
         jpegs=jpegs,
         course=course,

@@ -29,7 +29,7 @@ COURSE = "course.csv"
 
 
 @dataclass(frozen=True)
-class Scene:
+class ChaosScene:
     """``at_s``: seconds of the flight at which the fault of each phase begins. ``truth_sigma_m``: of the course.
     ``attitude_sigma_deg``: of roll and pitch that are reported; None: the default."""
 
@@ -49,7 +49,7 @@ class Scene:
         return self.jpegs[index].read_bytes()
 
 
-def scene_in(folder: Path, seed: int) -> Scene:
+def scene_in(folder: Path, seed: int) -> ChaosScene:
     """The flight in ``folder``, which is generated if it is not there. Raises OutputError, SourceError."""
     if not (folder / COURSE).exists():
         mission = folder.with_suffix(".waypoints")
@@ -61,7 +61,7 @@ def scene_in(folder: Path, seed: int) -> Scene:
     if not jpegs:
         raise SourceError(f"{folder}: has no images; remove it, and it is generated anew")
     duration_s = len(jpegs) / FRAME_HZ
-    return Scene(folder / MAP_NAME, jpegs, course, phases(course, duration_s), duration_s)
+    return ChaosScene(folder / MAP_NAME, jpegs, course, phases(course, duration_s), duration_s)
 
 
 def course_of(flight: Flight, folder: Path) -> Course:

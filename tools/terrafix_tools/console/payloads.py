@@ -104,7 +104,7 @@ class Waypoint(Strict):
     lon: Longitude
 
 
-class Area(Strict):
+class RouteArea(Strict):
     """The route of the flight, whose corridor is fetched from the map sources of the service in the background."""
 
     waypoints: Annotated[list[Waypoint], Field(min_length=2, max_length=MAX_WAYPOINTS)]
@@ -121,7 +121,7 @@ class NewFlight(Strict):
     telemetry: Telemetry = Telemetry()
     start: Start | None = None
     map: Annotated[str, Field(min_length=1, max_length=MAX_NAME)] | None = None
-    area: Area | None = None
+    area: RouteArea | None = None
     height_m: Annotated[float, Field(gt=0, le=20_000)] | None = None
     yaw_deg: Degrees | None = None  # heading for images that state none
 

@@ -23,7 +23,6 @@ from terrafix_tools.console.locating import LocatingProcess, Question
 from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
     Accepted,
-    Area,
     Flight,
     FlightKind,
     Flights,
@@ -36,6 +35,7 @@ from terrafix_tools.console.payloads import (
     ObjectPixel,
     RecordingFile,
     Recordings,
+    RouteArea,
     ServiceHealth,
     Steered,
     UserFix,
@@ -299,7 +299,7 @@ class Service:
     def _live_health(self, flight_id: str, found: dict[str, Any]) -> None:
         self._loop.call_soon_threadsafe(self.feeds.pass_on, flight_id, Health(facts=found))
 
-    def _maps_to_make(self) -> list[tuple[str, Area]]:
+    def _maps_to_make(self) -> list[tuple[str, RouteArea]]:
         with self.database.read() as db:
             return flights.maps_to_make(db)
 

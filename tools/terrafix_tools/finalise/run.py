@@ -169,7 +169,7 @@ def _smoothed(
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedCamera:
     """A camera with the covariance of its pose (6, 6), tangent order, and its calibration state."""
 
     pose: gtsam.Pose3
@@ -177,14 +177,14 @@ class Placed:
     bias: np.ndarray
 
 
-def solved_track(flight: FlightGraph, found: Smoothed) -> dict[int, Placed]:
+def solved_track(flight: FlightGraph, found: Smoothed) -> dict[int, PlacedCamera]:
     """By frame: the batch solution."""
-    return {i: Placed(found.poses[n], found.covs[n], found.bias[n]) for i, n in flight.node_of.items()}
+    return {i: PlacedCamera(found.poses[n], found.covs[n], found.bias[n]) for i, n in flight.node_of.items()}
 
 
-def heights_as_seen(flight: FlightGraph, track: dict[int, Placed]) -> dict[int, Placed]:
+def heights_as_seen(flight: FlightGraph, track: dict[int, PlacedCamera]) -> dict[int, PlacedCamera]:
     """The covariance with what the description leaves open of the focal length: heights are as seen through it."""
-    seen, camera = dict[int, Placed](), flight.origin.camera
+    seen, camera = dict[int, PlacedCamera](), flight.origin.camera
     for frame_id, at in track.items():
         up = at.pose.rotation().matrix()[UP]
         height_m = float(at.pose.translation()[UP]) - (flight.origin.ground_amsl_m or 0.0)
@@ -194,7 +194,7 @@ def heights_as_seen(flight: FlightGraph, track: dict[int, Placed]) -> dict[int, 
     return seen
 
 
-def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, Placed]:
+def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, PlacedCamera]:
     """By frame: the positions that the estimator refines after landing, as in estimates.csv; the attitude is the last
     one in flight."""
     map_var = shared_variance_m2(estimator.map_sigma_m)
@@ -205,11 +205,11 @@ def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, Placed
         state = flight.recorder.nodes[node].state
         r, cov = state.pose.rotation().matrix(), np.zeros((POSE_SIZE, POSE_SIZE))
         cov[TRANSLATION, TRANSLATION] = r.T @ (cov_m2 + np.diag([map_var, map_var, 0.0])) @ r
-        placed[frame_id] = Placed(gtsam.Pose3(state.pose.rotation(), p_m), cov, state.calibration)
+        placed[frame_id] = PlacedCamera(gtsam.Pose3(state.pose.rotation(), p_m), cov, state.calibration)
     return placed
 
 
-def _fill(row: FinalRow, placed: Placed, frame: LocalFrame, r_b_c: np.ndarray) -> None:
+def _fill(row: FinalRow, placed: PlacedCamera, frame: LocalFrame, r_b_c: np.ndarray) -> None:
     r_w_c, p = placed.pose.rotation().matrix(), placed.pose.translation()
     cov = tangent_to_world(placed.cov, r_w_c)
     tilt = exp_so3(np.array([*placed.bias[MOUNT_TILT], 0.0]))

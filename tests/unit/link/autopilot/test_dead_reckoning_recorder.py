@@ -60,7 +60,7 @@ def fix(t_s: float, fix_type: int = 3) -> GpsInput:
     return msgspec.structs.replace(GPS, t_ns=round(t_s * S), fix_type=fix_type, **where, **velocity)
 
 
-class Autopilot:
+class RecordingAutopilot:
     """An autopilot connected to successive link processes that share a checkpoint file."""
 
     def __init__(self, checkpoint_file: Path) -> None:
@@ -93,19 +93,19 @@ def dead_reckonings(messages: Iterable[Message]) -> list[EkfDeadReckoning]:
 
 
 @pytest.fixture
-def autopilot(tmp_path: Path) -> Autopilot:
-    return Autopilot(tmp_path / "link.checkpoint")
+def autopilot(tmp_path: Path) -> RecordingAutopilot:
+    return RecordingAutopilot(tmp_path / "link.checkpoint")
 
 
 @pytest.fixture
-def restarted(autopilot: Autopilot) -> Autopilot:
+def restarted(autopilot: RecordingAutopilot) -> RecordingAutopilot:
     """The link was killed in flight and has started again."""
     autopilot.fly_until_killed()
     autopilot.restart()
     return autopilot
 
 
-def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(restarted: Autopilot) -> None:
+def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(restarted: RecordingAutopilot) -> None:
     assert not dead_reckonings(
         restarted.sends(RESTARTED_S - 0.2, ekf_position(RESTARTED_S - 0.2))
     )  # EKF status and receivers are not known yet
@@ -123,7 +123,7 @@ def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(restarted: Aut
     assert message.delta_v_mps == pytest.approx((now[2] - before[2], now[3] - before[3], 0.0), abs=0.02)
 
 
-def test_a_restarted_link_requests_the_slow_messages(restarted: Autopilot) -> None:
+def test_a_restarted_link_requests_the_slow_messages(restarted: RecordingAutopilot) -> None:
     restarted.sends(RESTARTED_S, ekf_position(RESTARTED_S))
     assert set(restarted.requested()) == {193, 24, 124}  # EKF_STATUS_REPORT, GPS_RAW_INT, GPS2_RAW
     restarted.sends(RESTARTED_S + 0.5, status(), receiver(1))
@@ -132,7 +132,7 @@ def test_a_restarted_link_requests_the_slow_messages(restarted: Autopilot) -> No
 
 @pytest.mark.parametrize(("before", "after"), [(3, 1), (1, 3)])
 def test_no_dead_reckoning_is_published_while_another_receiver_has_a_fix(
-    autopilot: Autopilot, before: int, after: int
+    autopilot: RecordingAutopilot, before: int, after: int
 ) -> None:
     autopilot.fly_until_killed(receiver_fix=before)
     autopilot.restart()
@@ -142,24 +142,24 @@ def test_no_dead_reckoning_is_published_while_another_receiver_has_a_fix(
     )
 
 
-def test_no_dead_reckoning_is_published_before_the_known_receiver_is_received(restarted: Autopilot) -> None:
+def test_no_dead_reckoning_is_published_before_the_known_receiver_is_received(restarted: RecordingAutopilot) -> None:
     assert not dead_reckonings(restarted.sends(RESTARTED_S, status(), ekf_position(RESTARTED_S)))
     assert dead_reckonings(restarted.sends(RESTARTED_S + 0.2, receiver(1), ekf_position(RESTARTED_S + 0.2)))
 
 
 @pytest.mark.parametrize("flags", [mavlink.EKF_ATTITUDE, HEALTHY_FLAGS | mavlink.EKF_CONST_POS_MODE])
-def test_no_dead_reckoning_is_published_without_a_valid_ekf_velocity(restarted: Autopilot, flags: int) -> None:
+def test_no_dead_reckoning_is_published_without_a_valid_ekf_velocity(restarted: RecordingAutopilot, flags: int) -> None:
     assert not dead_reckonings(restarted.sends(RESTARTED_S, status(flags), receiver(1), ekf_position(RESTARTED_S)))
 
 
-def test_no_dead_reckoning_is_published_after_a_reboot_or_more_than_a_minute(restarted: Autopilot) -> None:
+def test_no_dead_reckoning_is_published_after_a_reboot_or_more_than_a_minute(restarted: RecordingAutopilot) -> None:
     assert not dead_reckonings(
         restarted.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S, boot_s=1.0))
     )
     assert not dead_reckonings(restarted.sends(80.0, status(), receiver(1), ekf_position(80.0)))
 
 
-def test_no_dead_reckoning_is_published_while_we_send_a_fix(autopilot: Autopilot) -> None:
+def test_no_dead_reckoning_is_published_while_we_send_a_fix(autopilot: RecordingAutopilot) -> None:
     autopilot.fly_until_killed()
     assert not dead_reckonings(autopilot.sends(KILLED_S + 0.1, ekf_position(KILLED_S + 0.1)))
     autopilot.link.edge.on_message(fix(KILLED_S + 0.2, fix_type=1))

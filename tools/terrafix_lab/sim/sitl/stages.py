@@ -19,10 +19,10 @@ from terrafix_lab.sim.flights.folder import AGL_SIGMA_M, ATTITUDE_SIGMA_DEG, CAM
 from terrafix_lab.sim.sitl.camera import SimulatedCamera
 from terrafix_lab.sim.sitl.firmware import Firmware
 from terrafix_lab.sim.sitl.firmware_log import POSITION_SOURCE
-from terrafix_lab.sim.sitl.ground_side import Ground
+from terrafix_lab.sim.sitl.ground_side import GroundSide
 from terrafix_lab.sim.sitl.observer import Observer
 from terrafix_lab.sim.sitl.report import FIX_3D, Interruption, Times
-from terrafix_lab.sim.sitl.scene import Scene
+from terrafix_lab.sim.sitl.scene import SitlScene
 from terrafix_tools import child_process
 from terrafix_tools.camera.description import write_toml
 
@@ -59,7 +59,14 @@ class Daemon:
     """
 
     def __init__(
-        self, out: Path, scene: Scene, source: str, link: str, *, start_configured: bool = True, gnss: str = "advise"
+        self,
+        out: Path,
+        scene: SitlScene,
+        source: str,
+        link: str,
+        *,
+        start_configured: bool = True,
+        gnss: str = "advise",
     ) -> None:
         """``start_configured``: the camera description contains the start. ``gnss``: link.gnss. Raises OutputError."""
         self._process: subprocess.Popen[bytes] | None = None
@@ -113,11 +120,11 @@ class Stages:
     def __init__(
         self,
         firmware: Firmware,
-        station: Ground,
+        station: GroundSide,
         observer: Observer,
         daemon: Daemon,
         camera: SimulatedCamera,
-        scene: Scene,
+        scene: SitlScene,
         console: Console,
     ) -> None:
         self._firmware, self._station, self._observer, self._camera = firmware, station, observer, camera

@@ -15,7 +15,6 @@ from terrafix_tools.console.compute.observed import FrameOutcome
 from terrafix_tools.console.events import Event, FlightCompleted, StateChanged, name_of
 from terrafix_tools.console.payloads import (
     Accepted,
-    Area,
     Flight,
     FlightKind,
     FlightMap,
@@ -27,6 +26,7 @@ from terrafix_tools.console.payloads import (
     InputRequest,
     MapState,
     NewFlight,
+    RouteArea,
     UserFix,
 )
 from terrafix_tools.console.problems import Refusal
@@ -117,7 +117,7 @@ def complete(db: sa.Connection, flight_id: str, completed: FlightCompleted) -> N
     update(db, flight_id, state=FlightState.COMPLETED.value, request=None)
 
 
-def maps_to_make(db: sa.Connection) -> list[tuple[str, Area]]:
+def maps_to_make(db: sa.Connection) -> list[tuple[str, RouteArea]]:
     """The flights whose maps are not made yet."""
     rows = db.execute(sa.select(flights.c.id, flights.c.spec).where(flights.c.map_state == MapState.PREPARING.value))
     specs = [(row.id, NewFlight.model_validate_json(row.spec).area) for row in rows]

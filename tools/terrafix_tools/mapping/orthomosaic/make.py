@@ -27,7 +27,7 @@ MAX_SIGMA_M = 10.0  # default of the largest stated 1-sigma of a frame that is u
 
 
 @dataclass(frozen=True)
-class Request:
+class OrthomosaicRequest:
     """The options of the command."""
 
     record: Path
@@ -50,7 +50,7 @@ class Made:
     statement: Statement
 
 
-def make(wanted: Request, *, progress: bool = False) -> Made:
+def make(wanted: OrthomosaicRequest, *, progress: bool = False) -> Made:
     """Raises SourceError, MapError, UsageError, OutputError."""
     if wanted.out.suffix.lower() not in (".tif", ".tiff"):
         raise UsageError(f"{wanted.out}: a GeoTIFF ends in .tif; choose another name")
