@@ -26,8 +26,16 @@ def hint(
     if not RADIUS_M[0] <= radius_m <= RADIUS_M[1]:
         raise UsageError(f"--radius {radius_m:g}: choose {RADIUS_M[0]:.0f} to {RADIUS_M[1]:.0f} metres")
     run_dir = chosen_run(run)
-    where = {"lat_deg": lat_deg, "lon_deg": lon_deg, "radius_m": radius_m, "source": "command line"}
-    prior = PositionHint(t_ns=now_ns(), frame_id=fix[0], sigma_m=fix[1], **where)
+    frame_id, sigma_m = fix
+    prior = PositionHint(
+        t_ns=now_ns(),
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        radius_m=radius_m,
+        source="command line",
+        frame_id=frame_id,
+        sigma_m=sigma_m,
+    )
     with Operator(run_dir, replies=HintVerdict, replier="anchor") as operator:
         if not operator.wait_for_subscribers(PositionHint, len(SUBSCRIBERS), SUBSCRIBE_TIMEOUT_S):
             raise LinkError(
