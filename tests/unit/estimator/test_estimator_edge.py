@@ -52,7 +52,7 @@ def received_and_published(messages: Iterable[Message]) -> list[Message]:
 
 
 def health(band: ThermalBand, temperature_c: float, cause: str = "") -> Health:
-    known = {"temperature_c": temperature_c, "cause": cause, "clock_mhz": 612.0}
+    known: dict[str, Any] = {"temperature_c": temperature_c, "cause": cause, "clock_mhz": 612.0}
     return Health(t_ns=0, band=band, throttled=False, disk_free_mb=None, **known)
 
 

@@ -1,5 +1,7 @@
 """A user fix is a gated measurement of the position of its frame."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -26,7 +28,7 @@ def flown(flight: Flight) -> EstimatorRun:
 
 def fix(flight: Flight, i: int, off_m: tuple[float, float] = (0.0, 0.0), sigma_m: float | None = 5.0) -> PositionHint:
     lat_deg, lon_deg = PLACE.to_wgs84(*(float(m) for m in flight.p_m[i, :2] + off_m))
-    position = {"lat_deg": lat_deg, "lon_deg": lon_deg, "radius_m": 15.0, "source": "console"}
+    position: dict[str, Any] = {"lat_deg": lat_deg, "lon_deg": lon_deg, "radius_m": 15.0, "source": "console"}
     return PositionHint(t_ns=t_ns(FRAMES - 1) + 7, frame_id=i, sigma_m=sigma_m, **position)
 
 
