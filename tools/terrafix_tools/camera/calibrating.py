@@ -37,7 +37,7 @@ class BoardView:
 
 
 @dataclass(frozen=True)
-class Fit:
+class LensFit:
     """``values``, ``sigmas`` (P,) by ``names``; of each view residuals (N, 2) [px], tilt (2,) [deg, about x, y]."""
 
     model: str
@@ -62,7 +62,7 @@ class Fit:
         )
 
 
-def calibrate(views: Sequence[BoardView], size: tuple[int, int], board: Board, model: str) -> Fit:
+def calibrate(views: Sequence[BoardView], size: tuple[int, int], board: Board, model: str) -> LensFit:
     """``size``: width, height; ``model``: "pinhole" (k1 k2 p1 p2 k3), "rational" (and k4 k5 k6) or "fisheye".
 
     Raises SourceError: what the set lacks, all of it in one line."""
@@ -110,7 +110,7 @@ def _uncovered(views: Sequence[BoardView], size: tuple[int, int], model: str) ->
     return [f"the board in these parts of the image: {', '.join(missing)}"] if missing else []
 
 
-def _fit(views: Sequence[BoardView], size: tuple[int, int], board: Board, model: str) -> Fit:
+def _fit(views: Sequence[BoardView], size: tuple[int, int], board: Board, model: str) -> LensFit:
     """Raises cv2.error."""
     points = [board.corners_mm[view.ids] for view in views]
     seen = [view.px for view in views]
@@ -140,7 +140,7 @@ def _fit(views: Sequence[BoardView], size: tuple[int, int], board: Board, model:
         projected, by_lens, by_pose = _projected(at, np.asarray(turn), np.asarray(shift), matrix, distortion, model)
         residuals.append(px - projected)
         jacobians.append((by_lens, by_pose))
-    return Fit(model, size, names, values, _sigmas(residuals, jacobians), residuals, _tilts_deg(turns))
+    return LensFit(model, size, names, values, _sigmas(residuals, jacobians), residuals, _tilts_deg(turns))
 
 
 def _projected(

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 
 from terrafix.core.errors import OutputError
-from terrafix_tools.camera.calibrating import MIN_CORNERS, BoardView, Fit
+from terrafix_tools.camera.calibrating import MIN_CORNERS, BoardView, LensFit
 
 ARROW_SHARE = 0.03  # of the image width: length of an arrow as long as the RMS of the residuals
 
 
-def fit_lines(fit: Fit, looked_at: int, views: Sequence[BoardView]) -> Iterator[str]:
+def fit_lines(fit: LensFit, looked_at: int, views: Sequence[BoardView]) -> Iterator[str]:
     """What was used, the residuals, and each parameter with its 1-sigma."""
     per_view = [float(np.sqrt(np.square(r).sum(axis=1).mean())) for r in fit.residuals]
     used = [view.name for view in views if len(view.ids) >= MIN_CORNERS]
@@ -25,7 +25,7 @@ def fit_lines(fit: Fit, looked_at: int, views: Sequence[BoardView]) -> Iterator[
         yield f"  {name} = {value:.6g} +- {sigma:.2g}"
 
 
-def draw(fit: Fit, views: Sequence[BoardView], out: Path) -> None:
+def draw(fit: LensFit, views: Sequence[BoardView], out: Path) -> None:
     """Writes a PNG: every corner of every view, with its residual as an arrow, enlarged. Raises OutputError."""
     width, height = fit.size
     picture = np.full((height, width, 3), 255, np.uint8)
