@@ -33,6 +33,7 @@ IMPORTED_AS = {
     "pyserial": "serial",
     "pyzmq": "zmq",
     "pillow": "PIL",
+    "pyyaml": "yaml",
     "python-multipart": "python_multipart",
     "faiss-cpu": "faiss",
     "systemd-python": "systemd",
