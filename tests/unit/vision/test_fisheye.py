@@ -12,8 +12,8 @@ from terrafix.messages import Camera
 from terrafix.vision.sources import open_source
 from terrafix.vision.sources.description import camera_of, read_description
 from terrafix.vision.sources.facts import facts_of
-from terrafix.vision.sources.fisheye import VIEW_HALF_DEG, FisheyeCamera, view_of
-from terrafix_lab.sim.camera.lens import Fisheye
+from terrafix.vision.sources.fisheye import VIEW_HALF_DEG, FisheyeCamera, project, view_of
+from terrafix_lab.sim.camera.lens import Fisheye, lens_of
 
 LENS = Fisheye(640, 480, 240.0, 242.0, 322.0, 236.0, (0.01, 0.004, -0.002, 0.0003))
 CAMERA = """[camera]
@@ -59,6 +59,13 @@ def test_a_ray_that_a_fisheye_images_is_where_the_pinhole_view_projects_it(tmp_p
         assert abs(right - 9) <= 1 and abs(down - 9) <= 1
         assert patch.max() > 200
     assert any("fisheye, of which 110 x 110 degrees are used" in fact.text for fact in facts_of(source))
+
+
+def test_the_simulated_camera_and_opencv_project_a_described_fisheye_alike(tmp_path: Path) -> None:
+    camera = described(tmp_path, CAMERA)
+    assert isinstance(camera, FisheyeCamera)
+    rays = np.array([[0.0, 0.0, 1.0], [0.3, -0.2, 1.0], [-2.0, 1.0, 1.0], [3.0, 3.0, 0.5]])
+    assert np.abs(lens_of(camera).project(rays) - project(camera, rays)).max() < 1e-6
 
 
 @pytest.mark.parametrize("fov_deg", [180.0, 100.0])

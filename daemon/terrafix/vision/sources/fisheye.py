@@ -12,6 +12,7 @@ from terrafix.messages import Camera, Origin
 from terrafix.vision.sources.contract import Shot, Source
 from terrafix.vision.sources.facts import Fact, facts_of
 
+# Off the axis; there a pixel sees three times the ground of one in the middle (1 / cos^2) [spec: geometry]
 VIEW_HALF_DEG = 55.0
 FULL_FOV_DEG = 180.0  # of a lens whose image circle is not stated
 STEP_DEG = 0.05  # to which the edge of the image is found
