@@ -59,6 +59,7 @@ def assert_no_estimate_is_worse_than_its_covariance(flown: MaplessFlight) -> Non
     assert max(nees) < GATE[2]
 
 
+@pytest.mark.nightly
 def test_at_the_end_of_a_second_lap_the_position_relative_to_the_start_is_known_to_a_third_of_a_percent_of_the_way(
     loop: Path,
 ) -> None:
