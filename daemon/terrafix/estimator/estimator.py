@@ -7,6 +7,7 @@ import numpy as np
 
 from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState, ImuQuery
 from terrafix.estimator.graph.pose_graph import PoseGraph
+from terrafix.estimator.integrity.doubts import Doubts
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.map_update import MapResult, MapUpdate
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
@@ -28,14 +29,11 @@ class Estimator:
         self._propagation = Propagation(self.state, prior)
         self._map_update = MapUpdate(self.state)
         self._relocalization_update = RelocalizationUpdate(self.state)
-        self._ambiguous: dict[int, np.ndarray] = {}  # frame -> covariance (2, 2) of two positions that it may have had
+        self.doubts = Doubts()
 
     def feed_frame(self, frame: FrameInput) -> PropagationResult:
         """A new node. -> the predicted camera and the verdicts on what was measured."""
-        result = self._propagation.advance(frame)
-        if self.hypotheses.other.probability > 0.0:  # for the refinement, which cannot tell right from wrong either
-            self._ambiguous[frame.frame_id] = self.hypotheses.other.inflation_m2()
-        return result
+        return self._propagation.advance(frame)
 
     def feed_map_match(self, match: MapMatch) -> MapResult:
         """Gated, and fused at the node of its frame."""
@@ -88,15 +86,15 @@ class Estimator:
     def refine(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """After landing: frame -> position (3,) and covariance (3, 3), by all that was measured in the flight; only of
         frames that a place stands behind."""
-        result, state = {}, self.state
+        result, state, doubts_m2 = {}, self.state, self.doubts.of_frames()
         jacobians = np.array(state.principal_point_jacobians).reshape(-1, 2, 2)
         frames = zip(state.frames, jacobians, *state.graph.refine(), strict=True)
         for node, (frame, jacobian, p_m, cov) in enumerate(frames):
             if state.first_placed_node is None or node < state.first_placed_node:
                 continue
             if np.isfinite(p_m).all() and np.isfinite(cov).all():
-                if frame in self._ambiguous:
-                    cov[:2, :2] += self._ambiguous[frame]
+                if frame in doubts_m2:
+                    cov[:2, :2] += doubts_m2[frame]
                 shift_m, shift_cov = state.principal_point.shift(jacobian)
                 p_m[:2] += shift_m
                 cov[:2, :2] += shift_cov

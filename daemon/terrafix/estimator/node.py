@@ -202,6 +202,7 @@ class EstimatorNode:
         """``time_offset``: of the camera, so far."""
         assert self._axes is not None and self._monitors is not None
         self._estimator = estimator
+        estimator.hypotheses.use(self._monitors.agreement)
         self._flight = EstimatedFlight(estimator, self._axes, time_offset, self._monitors, self._telemetry)
         return estimator
 
@@ -401,8 +402,12 @@ class EstimatorNode:
         return True
 
     def _claim(self, frame: FrameState) -> Claim:
+        """Of ``frame``, the newest one."""
         assert self._flight is not None
-        return self._flight.claim(frame)
+        claim, estimator = self._flight.claim(frame), self._flight.estimator
+        first_node, fix_s = estimator.state.first_node, estimator.last_fix_s
+        estimator.doubts.record(frame, first_node, fix_s, claim.own_m2, claim.doubt_m2)
+        return claim
 
     def _estimate(self, estimator: Estimator, frame: FrameState, budget: Claim, t_ns: int) -> NavEstimate:
         assert self._axes is not None

@@ -265,7 +265,7 @@ class FlightReplayer(EstimatorNode):
     def _add_match(self, received: MapMatch, verdict: Verdict, estimator: Estimator) -> None:
         flight, fix = self.flights[-1], self._fix(received, estimator)
         if (node := flight.node_of.get(received.frame_id)) is not None:
-            flight.lost_sigma_m[node] = estimator.hypotheses.anywhere_m
+            flight.lost_sigma_m[node] = estimator.doubts.sigma_m
         if isinstance(fix, Verdict):
             flight.refused[str(fix)] = flight.refused.get(str(fix), 0) + 1
         else:
