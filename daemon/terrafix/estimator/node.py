@@ -23,6 +23,7 @@ from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonito
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
 from terrafix.estimator.measurements.odometry import NO_NEW_VIEW
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
+from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
 from terrafix.estimator.output import (
     calibration_of,
@@ -56,6 +57,7 @@ from terrafix.messages import (
     NavEstimate,
     Odometry,
     Origin,
+    PositionHint,
     Prediction,
     Relocalization,
     ServedVehicle,
@@ -126,6 +128,7 @@ class EstimatorNode:
             ServedVehicle: self._on_served_vehicle,
             CandidateAttitude: self._on_candidate_attitude,
             EkfDeadReckoning: self._on_dead_reckoning,
+            PositionHint: self._on_position_hint,
             Health: self._on_health,
             Frame: self._on_frame,
             Odometry: self._on_odometry,
@@ -251,6 +254,22 @@ class EstimatorNode:
         )
         if placed and estimator.last is not None:
             yield self._estimate(estimator, estimator.last, self._claim(estimator.last), sample.t_ns)
+
+    def _on_position_hint(self, hint: PositionHint) -> Iterable[Message]:
+        """A user fix is a measurement of the position; a coarse hint is one of the search alone."""
+        estimator, axes = self._estimator, self._axes
+        if hint.sigma_m is None or estimator is None or axes is None:
+            return
+        if not self._relocated:
+            self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
+        fix = UserFixMeasurement(np.array(axes.to_local(hint.lat_deg, hint.lon_deg)), hint.sigma_m)
+        fusion = apply_user_fix(estimator.state, hint.frame_id, fix)
+        fragment = estimator.state.fragment_of(hint.frame_id)
+        for verdict in (fusion, *self._rebuild_verdicts(estimator)):
+            yield verdict_of(hint.t_ns, hint.frame_id, verdict, fragment)
+        if fusion.verdict is Verdict.ACCEPTED and estimator.last is not None:
+            self._relocated = True
+            yield self._estimate(estimator, estimator.last, self._claim(estimator.last), hint.t_ns)
 
     # --- frames --------------------------------------------------------------------------------------------------
 

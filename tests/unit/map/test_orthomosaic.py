@@ -16,17 +16,16 @@ from terrafix import messages as m
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Config
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix.core.geodesy import local_crs, quat_from_rot
-from terrafix.core.pose import exp_so3
+from terrafix.core.geodesy import local_crs
 from terrafix.map.package import MapPackage
 from terrafix.recorder.provenance import header
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.locate.locator import FlightLocator
-from terrafix_tools.locate.views import CameraView, read_views
+from terrafix_tools.locate.views import CameraView
 from terrafix_tools.mapping.area.build import with_statement
 from terrafix_tools.mapping.orthomosaic.composite import Composite, OrthomosaicGrid, grid_around
-from terrafix_tools.mapping.orthomosaic.frames import refined_views, spread
+from terrafix_tools.mapping.orthomosaic.frames import spread
 from terrafix_tools.mapping.orthomosaic.make import OrthomosaicRequest, make
 from terrafix_tools.mapping.orthomosaic.write import read_statement
 from terrafix_tools.mapping.sources.spec import SourceSpec
@@ -164,35 +163,6 @@ def test_frames_with_uncertain_positions_and_near_ones_are_left_out() -> None:
     assert [view.frame_id for view in spread(views, 10.0)] == [0, 2]
     hovering = {i: view_of(0) for i in range(3)} | {3: view_of(1)}
     assert [view.p_c_in_w_m[0] for view in spread(hovering, 10.0)] == [0.0, 20.0]
-
-
-def test_refined_positions_and_their_sigmas_are_used(tmp_path: Path) -> None:
-    lat_deg, lon_deg = ORIGIN.to_wgs84(41.0, -2.0)
-    pose = m.RefinedPose(frame_id=2, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=600.0, sigma_e_m=0.25, sigma_n_m=4.0)
-    other = m.RefinedPose(frame_id=99, lat_deg=0.0, lon_deg=0.0, alt_amsl_m=0.0, sigma_e_m=1.0, sigma_n_m=1.0)
-    write_flight(tmp_path, m.Refinement(t_ns=9 * PERIOD_NS, poses=[pose, other]), images=False)
-    locator = FlightLocator(read_views(tmp_path), None)
-    views = refined_views(locator, tmp_path)
-    assert views[2].p_c_in_w_m == pytest.approx([41.0, -2.0, 600.0], abs=1e-6)
-    # East is known better than in flight, north not: 1 m in flight, 4 m refined.
-    assert np.diag(views[2].cov)[:3] == pytest.approx([0.25**2, 1.0, 1.0])
-    assert views[1] is locator.flight.views[1]
-
-
-def test_a_refined_orientation_is_used_and_the_newest_refinement_of_a_frame_counts(tmp_path: Path) -> None:
-    lat_deg, lon_deg = ORIGIN.to_wgs84(41.0, -2.0)
-    turned = rig.r_w_c() @ exp_so3(np.array([0.0, 0.0, 0.02]))
-    old = m.RefinedPose(frame_id=2, lat_deg=0.0, lon_deg=0.0, alt_amsl_m=600.0, sigma_e_m=0.1, sigma_n_m=0.1)
-    pose = m.RefinedPose(
-        frame_id=2, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=600.0, sigma_e_m=0.25, sigma_n_m=4.0,
-        q_w_c=quat_from_rot(turned), rotation_sigma_rad=(1.0, 1e-6, 1.0))  # fmt: skip
-    refinements = [m.Refinement(t_ns=9 * PERIOD_NS, poses=[p], source=m.RefinementSource.SMOOTHER) for p in (old, pose)]
-    write_flight(tmp_path, *refinements, images=False)
-    locator = FlightLocator(read_views(tmp_path), None)
-    view, before = refined_views(locator, tmp_path)[2], locator.flight.views[2]
-    assert view.p_c_in_w_m[:2] == pytest.approx([41.0, -2.0], abs=1e-6)
-    assert np.allclose(view.r_w_c, turned, atol=1e-9)
-    assert np.diag(view.cov)[4] == pytest.approx(1e-12) and np.diag(view.cov)[3] == np.diag(before.cov)[3]
 
 
 def test_default_pixel_is_that_of_the_frames_and_the_raster_holds_all_of_them() -> None:

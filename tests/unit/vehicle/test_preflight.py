@@ -461,9 +461,10 @@ def test_restore_leaves_the_state_of_another_vehicle(wired: Wired, second: list[
     assert PreviousSourceFile(state).load() is not None
 
 
-def test_without_confirmation_nothing_is_set(wired: Wired, tmp_path: Path) -> None:
+@pytest.mark.parametrize("answer", ["n\n", "\n"], ids=["no", "return alone"])
+def test_without_confirmation_nothing_is_set(wired: Wired, tmp_path: Path, answer: str) -> None:
     there = wired(DEFAULTS)
-    done = run("--write", "--autopilot-only", "--out", str(tmp_path), answer="n\n")
+    done = run("--write", "--autopilot-only", "--out", str(tmp_path), answer=answer)
     assert done.exit_code == 1
     assert "GPS1_TYPE        1 -> 14" in done.output
     assert there.parameters_set == []

@@ -23,7 +23,6 @@ from terrafix_lab.faults.edits import OriginEdit, unchanged_origin
 from terrafix_lab.faults.fault import Need
 from terrafix_lab.faults.processes import COOL_MC, SUPERVISOR
 from terrafix_lab.sim.autopilot.course import PeerState
-from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.autopilot.peer import AutopilotPeer
 from terrafix_lab.sim.camera.stream import FrameStream
 from terrafix_tools import child_process
@@ -64,7 +63,7 @@ class Rig:
         self.out.mkdir()
         self.map_path.write_bytes(scene.map_path.read_bytes())
         self.set_temperature(COOL_MC)
-        self.peer: AutopilotPeer = AutopilotPeer(seed=seed, kind=Kind.COPTER, home_amsl_m=self._home_amsl_m())
+        self.peer: AutopilotPeer = AutopilotPeer(seed=seed, kind=scene.kind, home_amsl_m=self._home_amsl_m())
         self.stream = FrameStream()
         self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s, scene.frame_hz)
         self.switches = Switches(folder / "switches")

@@ -17,8 +17,7 @@ class Question(msgspec.Struct):
 
     out: str
     map: str
-    frame_id: int
-    pixel: tuple[float, float]  # of the frame as it was read
+    pixels: list[tuple[int, tuple[float, float]]]  # frame, and pixel of the frame as it was read
 
 
 class LocateAnswer(msgspec.Struct):
@@ -30,6 +29,7 @@ class LocateAnswer(msgspec.Struct):
     alt_amsl_m: float | None = None
     radius95_m: float = 0.0
     surface: str = ""
+    consistent: bool = True
 
 
 class LocatingProcess:

@@ -352,13 +352,16 @@ def test_rejected_coarse_matches_count_against_registration() -> None:
     assert [(fault.quantity, fault.active) for fault in faults] == [("registration", True)]
 
 
-def test_correlations_over_ground_without_texture_are_ignored() -> None:
-    def nothing(message: Message) -> Message:
-        if isinstance(message, Odometry):
-            return msgspec.structs.replace(message, verdict=Verdict.NO_FEATURES, two_view=[])
-        return _unmatched(message)
-
-    assert _fly(nothing, fix_every=1)[1] == []
+@pytest.mark.parametrize(("verdict", "counts"), [(Verdict.ACCEPTED, True), (Verdict.NO_FEATURES, False)])
+def test_correlations_count_over_ground_with_texture_alone(verdict: Verdict, counts: bool) -> None:
+    monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(30, fix_every=1, dem=True)
+    for i in range(30):
+        state, odometry, match = flight.messages(i)
+        assert isinstance(odometry, Odometry) and isinstance(match, MapMatch)
+        telemetry.add(state)
+        monitors.on_odometry(msgspec.structs.replace(odometry, verdict=verdict), telemetry, 1.0 * HEIGHT_M, HEIGHT_M)
+        monitors.on_map_match(_unmatched(match), telemetry, accepted=False)
+    assert [fault.quantity for fault in monitors.take_changes(t_ns(30))] == (["registration"] if counts else [])
 
 
 @pytest.mark.slow

@@ -24,6 +24,8 @@ SPEED_MPS, RATE_RADPS = 22.0, 0.4  # a bank of 42 degrees
 KILLED_S, RESTARTED_S = 2.0, 8.0
 EKF_ERROR_M, EKF_ERROR_MPS = (30.0, -10.0), (0.5, -0.25)  # constant errors of the EKF: position, velocity
 
+CLIMB_MPS2 = 0.05  # the climb rate grows
+
 
 def truth(t_s: float) -> tuple[float, float, float, float]:
     """-> east, north [m] and their velocities [m/s] of a circling plane."""
@@ -39,7 +41,7 @@ def ekf_position(t_s: float, boot_s: float = 100.0) -> Any:
         north_m + EKF_ERROR_M[1] + EKF_ERROR_MPS[1] * t_s,
     )
     lat_deg, lon_deg = PLACE.to_wgs84(east_m, north_m)
-    cm = round(100 * (vn + EKF_ERROR_MPS[1])), round(100 * (ve + EKF_ERROR_MPS[0])), -150
+    cm = round(100 * (vn + EKF_ERROR_MPS[1])), round(100 * (ve + EKF_ERROR_MPS[0])), -round(100 * CLIMB_MPS2 * t_s)
     place = round(lat_deg * 1e7), round(lon_deg * 1e7), 500_000, 120_000
     return mavlink.MAVLink_global_position_int_message(round(1e3 * (boot_s + t_s)), *place, *cm, 0)
 
@@ -120,7 +122,10 @@ def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(restarted: Rec
     # Displacement and change of velocity do not contain the error that the EKF had at that time.
     way_m = [now[i] - before[i] - message.duration_s * before[2 + i] for i in range(2)]
     assert message.delta_p_m == pytest.approx(way_m, abs=0.3) and math.hypot(*way_m) > 50.0
-    assert message.delta_v_mps == pytest.approx((now[2] - before[2], now[3] - before[3], 0.0), abs=0.02)
+    assert message.delta_v_mps == pytest.approx(
+        (now[2] - before[2], now[3] - before[3], CLIMB_MPS2 * message.duration_s), abs=0.02
+    )
+    assert message.delta_v_mps[2] > 0.2
 
 
 def test_a_restarted_link_requests_the_slow_messages(restarted: RecordingAutopilot) -> None:

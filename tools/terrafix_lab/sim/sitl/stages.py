@@ -15,7 +15,6 @@ from rich.console import Console
 
 from terrafix.core.errors import LinkError, OutputError
 from terrafix.vision.sources.description import CameraTable, Description, MountTable, StartTable, TelemetryTable
-from terrafix_lab.sim.flights.description import write_toml
 from terrafix_lab.sim.flights.folder import AGL_SIGMA_M, ATTITUDE_SIGMA_DEG, CAMERA, YAW_SIGMA_DEG
 from terrafix_lab.sim.sitl.camera import SimulatedCamera
 from terrafix_lab.sim.sitl.firmware import Firmware
@@ -25,6 +24,7 @@ from terrafix_lab.sim.sitl.observer import Observer
 from terrafix_lab.sim.sitl.report import FIX_3D, Interruption, Times
 from terrafix_lab.sim.sitl.scene import SitlScene
 from terrafix_tools import child_process
+from terrafix_tools.camera.description import write_toml
 
 GPS_ID = 1  # Terrafix is the second GPS
 BOOT_S = 120.0  # time-out until the filter has a position
@@ -283,7 +283,7 @@ def _description(start: StartTable | None) -> Description:
     return Description(
         name="ardupilot",
         camera=CameraTable.of(CAMERA),
-        mount=MountTable(pitch_deg=CAMERA.mount_pitch_deg, tolerance_deg=CAMERA.mount_tolerance_deg),
+        mount=MountTable.of(CAMERA),
         start=start,
         telemetry=TelemetryTable(
             yaw_sigma_deg=YAW_SIGMA_DEG, agl_sigma_m=AGL_SIGMA_M, attitude_sigma_deg=ATTITUDE_SIGMA_DEG

@@ -13,6 +13,7 @@ import msgspec
 from terrafix.core.errors import TerrafixError
 from terrafix.runtime.fork_server import set_parent_death_signal
 from terrafix_tools.console.locating import LocateAnswer, Question
+from terrafix_tools.finalised import TABLE
 from terrafix_tools.locate.locator import FlightLocator
 
 NICE = 5  # after the service, before the flights [spec: nice(2)]
@@ -28,7 +29,7 @@ class Locators:
     def answer(self, question: Question) -> LocateAnswer:
         try:
             locator = self._of(Path(question.out), Path(question.map) if question.map else None)
-            found = locator.locate([(str(question.frame_id), question.pixel)])
+            found = locator.locate([(str(frame_id), pixel) for frame_id, pixel in question.pixels])
         except TerrafixError as error:
             return LocateAnswer(refused=str(error))
         except OSError as error:
@@ -40,10 +41,11 @@ class Locators:
             alt_amsl_m=float(found.p_m[2]) if locator.amsl_known else None,
             radius95_m=found.radius95_m,
             surface=str(found.surface),
+            consistent=found.consistent,
         )
 
     def _of(self, out: Path, map_path: Path | None) -> FlightLocator:
-        files = {file.name: file.stat() for file in out.glob("flight*.mcap*")}
+        files = {file.name: file.stat() for file in (*out.glob("flight*.mcap*"), *out.glob(TABLE))}
         key = str(out), tuple((name, found.st_size, found.st_mtime_ns) for name, found in sorted(files.items()))
         if self._locator is None or key != self._key:
             self._locator, self._key = FlightLocator.open(out, map_path), key

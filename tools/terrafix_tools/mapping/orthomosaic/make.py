@@ -17,7 +17,7 @@ from terrafix_tools.locate.views import CameraView
 from terrafix_tools.log.contents import read_contents
 from terrafix_tools.mapping.build_checks import check_date
 from terrafix_tools.mapping.orthomosaic.composite import Composite, grid_around, is_steep
-from terrafix_tools.mapping.orthomosaic.frames import images, refined_views, spread
+from terrafix_tools.mapping.orthomosaic.frames import images, spread
 from terrafix_tools.mapping.orthomosaic.write import Statement, write_cog
 from terrafix_tools.mapping.sources.utm import utm_epsg
 from terrafix_tools.progress import progress_bar
@@ -58,7 +58,7 @@ def make(wanted: OrthomosaicRequest, *, progress: bool = False) -> Made:
         raise OutputError(f"{wanted.out.parent}: no such folder; make it, or choose another file")
     check_date(wanted.date)
     locator = FlightLocator.open(wanted.record, wanted.map_path)
-    views = spread(refined_views(locator, wanted.record), wanted.max_sigma_m)
+    views = spread(locator.flight.views, wanted.max_sigma_m)
     if not views:
         raise SourceError(
             f"{wanted.record}: no frame has a position that is known to {wanted.max_sigma_m:g} m; give a larger --sigma"
