@@ -215,18 +215,18 @@ class RecordedEstimator(Estimator):
         return result
 
 
-class FlightReplayer:
-    """Feeds a record, message after message, to the node that flew. ``flights``: one for each Origin, and each
+class FlightReplayer(EstimatorNode):
+    """The node that flew, which keeps what it is fed. ``flights``: one for each Origin, and each
     InitialPosition, from which its estimator began; ``estimators``: those of them. ``hold_out_every``: of the runs of
     HELD_OUT_RUN map matches with a pose, one in so many is held out; 0: none."""
 
     def __init__(self, hold_out_every: int = 0) -> None:
         self.flights: list[FlightGraph] = []
         self.estimators: list[Estimator] = []
-        self.node = EstimatorNode(make_estimator=self._make_estimator)
+        super().__init__(make_estimator=self._recorded_estimator)
         self._hold_out_every, self._with_pose = hold_out_every, 0
 
-    def _make_estimator(self, origin: Origin, prior: NavPrior | None) -> Estimator:
+    def _recorded_estimator(self, origin: Origin, prior: NavPrior | None) -> Estimator:
         self.flights.append(FlightGraph(origin))
         self.estimators.append(RecordedEstimator(origin, prior, self.flights[-1]))
         return self.estimators[-1]
@@ -234,8 +234,8 @@ class FlightReplayer:
     def on(self, message: Message) -> Iterable[Message]:
         if isinstance(message, MapMatch) and self._holds_out(message):
             return []
-        published = list(self.node.on(message))
-        estimator = self.node.estimator
+        published = list(super().on(message))
+        estimator = self.estimator
         if estimator is None:
             return published
         flight = self.flights[-1]
@@ -255,7 +255,7 @@ class FlightReplayer:
 
     def _holds_out(self, match: MapMatch) -> bool:
         """Counts the matches with a pose, and holds out one run in ``hold_out_every``, where its frames have nodes."""
-        estimator = self.node.estimator
+        estimator = self.estimator
         if not self._hold_out_every or estimator is None or match.verdict is not Verdict.ACCEPTED:
             return False
         run, self._with_pose = self._with_pose // HELD_OUT_RUN, self._with_pose + 1
