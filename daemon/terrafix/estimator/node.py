@@ -311,7 +311,8 @@ class EstimatorNode:
             orientation = estimator.state.orientation.fault
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
-            if estimator.state.orientation.suspects:  # turned or mirrored images move otherwise at any time
+            # Turned or mirrored images move otherwise at any time, repeated ones not at all.
+            if estimator.state.orientation.suspects or result.verdict is Verdict.STALLED:
                 time_offset.forget_images()
             else:
                 time_offset.add(stamped, self._telemetry, agl_m)
