@@ -391,12 +391,15 @@ class SearchPlaces(Message, frozen=True, kw_only=True):
 class PositionHint(Message, frozen=True, kw_only=True):
     """A coarse position prior for the search, from the operator, or from the autopilot after a restart in flight.
 
-    ``radius_m``: 95 % radius about the given position, at ``t_ns``, the time at which the hint was given."""
+    ``radius_m``: 95 % radius about the given position, at ``t_ns``, the time at which the hint was given. A user fix is
+    also a measurement: the camera of ``frame_id`` is there, with ``sigma_m`` per axis."""
 
     lat_deg: float
     lon_deg: float
     radius_m: float
-    source: str  # "ground station 255", "command line", "autopilot"
+    source: str  # "ground station 255", "command line", "autopilot", "console"
+    frame_id: int = -1
+    sigma_m: float | None = None  # None: a coarse hint, which the search alone uses
 
 
 class EkfDeadReckoning(Message, frozen=True, kw_only=True):
@@ -597,7 +600,11 @@ class RefinementSource(StrEnum):
 
 
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
-    """Camera at frame ``frame_id``. ``cov_en_m2``: covariance of east and north."""
+    """Camera at frame ``frame_id``. ``cov_en_m2``: covariance of east and north.
+
+    ``cov``: position [m], then rotation [rad], world axes; its horizontal part is that of the sigmas. The estimator's
+    own refinement (FLIGHT) refines positions: the orientation is that with which the frame has left the window, and
+    the terms between both are zero."""
 
     frame_id: int
     lat_deg: float
@@ -607,8 +614,11 @@ class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
     sigma_n_m: float
     cov_en_m2: float = 0.0
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none, or unknown
-    q_w_c: Quat | None = None  # orientation of the camera; None: not refined
-    rotation_sigma_rad: Vec3 | None = None  # 1-sigma about east, north, up
+    q_w_c: Quat | None = None  # orientation of the camera; None, and ``cov``: of an earlier version
+    cov: Mat6 | None = None
+    # Metres of a unit of the submap of the frame: of odometry, in metres by the heights of the flight; None: no scale
+    # was estimated, and the one that an earlier Refinement states for this frame holds
+    m_per_unit: float | None = None
 
 
 class ClaimBudget(Message, frozen=True, kw_only=True):
@@ -634,8 +644,8 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
 
     frame_id: int  # -1: not related to a frame
     # From the estimator "odometry", "link" (odometry with one more keyframe), "map", "relocalization", "attitude" (the
-    # reported heading), "height", "airspeed", "dead_reckoning", "start", "reset" (of the graph); from the link
-    # "estimate", "telemetry", "wall clock"
+    # reported heading), "height", "airspeed", "dead_reckoning", "start", "reset" (of the graph), "user_fix"; from the
+    # link "estimate", "telemetry", "wall clock"
     measurement: str
     verdict: Verdict
     detail: str = ""
@@ -862,6 +872,7 @@ class Health(Message, frozen=True, kw_only=True):
     cause: str  # reason of the band
     power_w: float | None = None  # of the whole computer; None: no rail measures it
     clock_limit: float | None = None  # lowest ratio of limit_mhz and max_mhz over the processors; None: not readable
+    clock_mhz: float | None = None  # ... and limit_mhz of that processor
 
 
 class ProcessEvent(Message, frozen=True, kw_only=True):

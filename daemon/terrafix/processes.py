@@ -128,6 +128,7 @@ PROCESSES: tuple[Process, ...] = (
             m.ServedVehicle,
             m.CandidateAttitude,
             m.EkfDeadReckoning,
+            m.PositionHint,
             m.Odometry,
             m.Relocalization,
             m.MapMatch,

@@ -23,6 +23,7 @@ from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonito
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
 from terrafix.estimator.measurements.odometry import NO_NEW_VIEW
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
+from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
 from terrafix.estimator.output import (
     calibration_of,
@@ -56,6 +57,7 @@ from terrafix.messages import (
     NavEstimate,
     Odometry,
     Origin,
+    PositionHint,
     Prediction,
     Relocalization,
     ServedVehicle,
@@ -126,6 +128,7 @@ class EstimatorNode:
             ServedVehicle: self._on_served_vehicle,
             CandidateAttitude: self._on_candidate_attitude,
             EkfDeadReckoning: self._on_dead_reckoning,
+            PositionHint: self._on_position_hint,
             Health: self._on_health,
             Frame: self._on_frame,
             Odometry: self._on_odometry,
@@ -202,6 +205,7 @@ class EstimatorNode:
         """``time_offset``: of the camera, so far."""
         assert self._axes is not None and self._monitors is not None
         self._estimator = estimator
+        estimator.hypotheses.use(self._monitors.agreement)
         self._flight = EstimatedFlight(estimator, self._axes, time_offset, self._monitors, self._telemetry)
         return estimator
 
@@ -250,6 +254,22 @@ class EstimatorNode:
         )
         if placed and estimator.last is not None:
             yield self._estimate(estimator, estimator.last, self._claim(estimator.last), sample.t_ns)
+
+    def _on_position_hint(self, hint: PositionHint) -> Iterable[Message]:
+        """A user fix is a measurement of the position; a coarse hint is one of the search alone."""
+        estimator, axes = self._estimator, self._axes
+        if hint.sigma_m is None or estimator is None or axes is None:
+            return
+        if not self._relocated:
+            self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
+        fix = UserFixMeasurement(np.array(axes.to_local(hint.lat_deg, hint.lon_deg)), hint.sigma_m)
+        fusion = apply_user_fix(estimator.state, hint.frame_id, fix)
+        fragment = estimator.state.fragment_of(hint.frame_id)
+        for verdict in (fusion, *self._rebuild_verdicts(estimator)):
+            yield verdict_of(hint.t_ns, hint.frame_id, verdict, fragment)
+        if fusion.verdict is Verdict.ACCEPTED and estimator.last is not None:
+            self._relocated = True
+            yield self._estimate(estimator, estimator.last, self._claim(estimator.last), hint.t_ns)
 
     # --- frames --------------------------------------------------------------------------------------------------
 
@@ -402,8 +422,12 @@ class EstimatorNode:
         return True
 
     def _claim(self, frame: FrameState) -> Claim:
+        """Of ``frame``, the newest one."""
         assert self._flight is not None
-        return self._flight.claim(frame)
+        claim, estimator = self._flight.claim(frame), self._flight.estimator
+        first_node, fix_s = estimator.state.first_node, estimator.last_fix_s
+        estimator.doubts.record(frame, first_node, fix_s, claim.own_m2, claim.doubt_m2)
+        return claim
 
     def _estimate(self, estimator: Estimator, frame: FrameState, budget: Claim, t_ns: int) -> NavEstimate:
         assert self._axes is not None

@@ -25,7 +25,7 @@ from autopilot_logs import (
 from terrafix.core.errors import SourceError
 from terrafix_tools.autopilot_log.dataflash import read_dataflash
 from terrafix_tools.autopilot_log.read import is_autopilot_log, read_autopilot_log
-from terrafix_tools.autopilot_log.structure import Attitude, AutopilotLog, Event, cleaned
+from terrafix_tools.autopilot_log.structure import Attitude, AutopilotLog, LogEvent, cleaned
 
 S = 1_000_000
 FLOWN = part(flight(seed=1), 20.0, 24.0)
@@ -208,7 +208,7 @@ def test_the_real_log_of_2015_is_read(data_set: Callable[[str], Path]) -> None:
     assert log.span_s == pytest.approx((11.478, 253.981))
     assert (len(log.attitude.t_s), log.counts["IMU"], len(log.gps[0].t_s)) == (2383, 11916, 1199)
     assert log.gps[0].lat_deg[-1] == pytest.approx(-35.36, abs=0.01) and set(log.gps[0].fix_type) == {1.0, 3.0}
-    assert Event(217.209, "mode", "acro") in log.events
+    assert LogEvent(217.209, "mode", "acro") in log.events
     assert log.ratios[0].values["velocity"].max() == pytest.approx(3.09)
 
 

@@ -31,6 +31,7 @@ IMPORTED_AS = {
     "protobuf": "google",
     "opencv-python-headless": "cv2",
     "pyserial": "serial",
+    "pyyaml": "yaml",
     "pyzmq": "zmq",
     "pillow": "PIL",
     "python-multipart": "python_multipart",
@@ -146,6 +147,7 @@ def test_the_version_is_the_same_in_code_metadata_and_changelog() -> None:
     assert metadata.version("terrafix") == version
     newest = re.search(r"^## \[([^\]]+)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.M)
     assert newest is not None and newest[1] == version
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_the_licence_file_matches_the_declared_licence() -> None:
@@ -228,7 +230,7 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
     assert not (unpacked / "terrafix_engines" / "train").exists()
     shown = in_wheel(unpacked, "--help")
     commands = [line.split()[1] for line in shown.stdout.splitlines() if re.match(r"│ [a-z]", line)]
-    at_it = "run replay evaluate report preflight status hint log source files models map"
+    at_it = "run status hint preflight camera source files models replay report evaluate log map"
     assert commands == at_it.split(), shown.stderr
     status = in_wheel(unpacked, "status", "--run", "nowhere")
     assert status.returncode == 2 and status.stderr.startswith("terrafix: nowhere: no such folder; omit --run")

@@ -31,7 +31,7 @@ from terrafix_lab.standalone import run_standalone
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, choose
-from terrafix_tools.finalise.run import Placed, heights_as_seen, refined_track, solved_track
+from terrafix_tools.finalise.run import PlacedCamera, heights_as_seen, refined_track, solved_track
 
 SEED, DURATION_S = 41, 300.0
 FOCAL_ERROR, FOCAL_SIGMA, K1_ERROR = 0.03, 0.05, -0.03  # of the true camera, relative; as described; of the true lens
@@ -54,7 +54,7 @@ class RecordedRun(Run):
         graph.recorder.store_estimates()
         return graph
 
-    def errors(self, placed: dict[int, Placed]) -> tuple[np.ndarray, np.ndarray]:
+    def errors(self, placed: dict[int, PlacedCamera]) -> tuple[np.ndarray, np.ndarray]:
         """-> error of every frame, east, north and up (N, 3) [m], and its covariance (N, 3, 3), world axes."""
         errors_m, covs = [], []
         for frame_id, at in placed.items():

@@ -10,7 +10,7 @@ from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.sources.description import camera_of, read_description
 from terrafix.vision.sources.table import Row, read_table
-from terrafix_lab.chaos.scene import Scene, phases_in_the_air
+from terrafix_lab.chaos.scene import ChaosScene, phases_in_the_air
 from terrafix_lab.sim.autopilot.course import PeerState, read_course, write_course
 from terrafix_tools.evaluate import Truth, read_truth, truth_sigma_of
 from terrafix_tools.flight_map import package_of
@@ -20,7 +20,7 @@ UNEVEN = 0.1  # share of the period by which images of an even rate may be off
 ATTITUDE_SIGMA_DEG = 5.0  # of roll and pitch where none were recorded: the course is level [measured: docs/faults.md]
 
 
-def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> Scene:
+def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> ChaosScene:
     """``flight``: folder with flight.toml, frames.csv, JPEG frames and truth.csv; ``map_path``: None for the one that
     it names. Its course is written into ``folder``. Raises SourceError, EvaluationError, MapError, OutputError."""
     description = read_description(flight / "flight.toml")
@@ -40,7 +40,7 @@ def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> Scene:
     write_course(course_csv, zip(times_s.tolist(), states, strict=True))
     course = read_course(course_csv)
     has_attitude = all(row.state is not None and row.state.roll_rad is not None for row in rows)
-    return Scene(
+    return ChaosScene(
         map_path=package_of(map_path or (flight / description.map).resolve(), progress=True),
         jpegs=jpegs,
         course=course,

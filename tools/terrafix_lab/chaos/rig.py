@@ -16,7 +16,7 @@ from terrafix.runtime.run_dir import PREFIX, SHM, write_atomic
 from terrafix_lab.chaos.camera import StreamedCamera, camera_toml
 from terrafix_lab.chaos.console import Console
 from terrafix_lab.chaos.memory_group import MemoryGroup
-from terrafix_lab.chaos.scene import Scene
+from terrafix_lab.chaos.scene import ChaosScene
 from terrafix_lab.chaos.serial_line import SerialLine
 from terrafix_lab.chaos.switches import Switches
 from terrafix_lab.faults.edits import OriginEdit, unchanged_origin
@@ -40,7 +40,7 @@ class Rig:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: ChaosScene,
         folder: Path,
         start_s: float,
         *,

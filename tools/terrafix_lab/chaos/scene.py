@@ -31,7 +31,7 @@ COURSE = "course.csv"
 
 
 @dataclass(frozen=True)
-class Scene:
+class ChaosScene:
     """``at_s``: seconds of the flight at which the fault of each phase begins. ``truth_sigma_m``: of the course.
     ``attitude_sigma_deg``: of roll and pitch that are reported; None: the default."""
 
@@ -52,7 +52,7 @@ class Scene:
         return self.jpegs[index].read_bytes()
 
 
-def scene_in(folder: Path, seed: int, kind: Kind = Kind.COPTER) -> Scene:
+def scene_in(folder: Path, seed: int, kind: Kind = Kind.COPTER) -> ChaosScene:
     """The flight in ``folder``, which is generated if it is not there: of a copter from ground to ground, or of a plane
     in the air. Raises OutputError, SourceError."""
     if not (folder / COURSE).exists():
@@ -68,7 +68,7 @@ def scene_in(folder: Path, seed: int, kind: Kind = Kind.COPTER) -> Scene:
         raise SourceError(f"{folder}: has no images; remove it, and it is generated anew")
     duration_s = len(jpegs) / FRAME_HZ
     at_s = phases(course, duration_s) if kind is Kind.COPTER else phases_in_the_air(course, duration_s)
-    return Scene(folder / MAP_NAME, jpegs, course, at_s, duration_s, kind=kind)
+    return ChaosScene(folder / MAP_NAME, jpegs, course, at_s, duration_s, kind=kind)
 
 
 def course_of(flight: Flight, folder: Path) -> Course:

@@ -46,7 +46,7 @@ DigestsOf = Callable[[Path, Path], dict[str, Digest]]  # (data folder, working f
 
 
 @dataclass(frozen=True)
-class Case:
+class GoldenCase:
     """``needs``: required files of the data folder."""
 
     name: str
@@ -168,26 +168,26 @@ def link(_: Path, work: Path) -> dict[str, Digest]:
 
 
 CASES = (
-    Case("montecarlo", montecarlo),
-    Case("copter", _simulated(Kind.COPTER, 31)),
-    Case("plane", _simulated(Kind.PLANE, 32)),
-    Case("restart in flight", _simulated(Kind.COPTER, 31, restarted)),
-    Case("link", link),
-    Case(
+    GoldenCase("montecarlo", montecarlo),
+    GoldenCase("copter", _simulated(Kind.COPTER, 31)),
+    GoldenCase("plane", _simulated(Kind.PLANE, 32)),
+    GoldenCase("restart in flight", _simulated(Kind.COPTER, 31, restarted)),
+    GoldenCase("link", link),
+    GoldenCase(
         "village-1 on 2014-01",
         _replayed(VILLAGE, "maps/village-2014-01.tif"),
         (VILLAGE, "maps/village-2014-01.tif"),
     ),
-    Case(
+    GoldenCase(
         "village-1 on 2014-03",
         _replayed(VILLAGE, "maps/village-2014-03.tif"),
         (VILLAGE, "maps/village-2014-03.tif"),
     ),
-    Case(
+    GoldenCase(
         "village-1 by XFeat",
         _replayed(VILLAGE, "maps/village-2014-01.tif", ("xfeat=models/xfeat.onnx",)),
         (VILLAGE, "maps/village-2014-01.tif", "models/xfeat.onnx"),
     ),
-    Case("town-a", _replayed(TOWN, "maps/town.tif"), (TOWN, "maps/town.tif")),
-    Case("finalise village-1", finalised, (VILLAGE, "maps/village-2014-01.tif")),
+    GoldenCase("town-a", _replayed(TOWN, "maps/town.tif"), (TOWN, "maps/town.tif")),
+    GoldenCase("finalise village-1", finalised, (VILLAGE, "maps/village-2014-01.tif")),
 )

@@ -34,7 +34,7 @@ from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.faults import Faults
 from terrafix_lab.montecarlo.flown import Shot, fly
 from terrafix_lab.montecarlo.ground import MapError, Terrain
-from terrafix_lab.montecarlo.lens import Lens
+from terrafix_lab.montecarlo.lens import TrueLens
 from terrafix_lab.montecarlo.lies import FindMatch, Lies
 from terrafix_lab.montecarlo.matches import MapMatches
 from terrafix_lab.montecarlo.plan import FlightPlan
@@ -110,7 +110,7 @@ class Run:
         focal_error = plan.focal_error
         if described.fx != plan.camera.fx:
             focal_error = (1.0 + focal_error) * plan.camera.fx / described.fx - 1.0
-        lens = Lens(CameraCalibration.of(described), focal_error, plan.k1_error)
+        lens = TrueLens(CameraCalibration.of(described), focal_error, plan.k1_error)
         sightings = SimulatedOdometry(lens, flown.terrain, plan.seed)
         matches = MapMatches(
             lens,

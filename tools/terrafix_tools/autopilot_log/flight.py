@@ -9,7 +9,7 @@ import numpy as np
 from terrafix.core.errors import SourceError
 from terrafix.messages import GpsInput, Origin, PositionSource, VehicleState
 from terrafix.recorder.reader import ReadResult, check_format, read_received
-from terrafix_tools.autopilot_log.structure import Attitude, Event, cleaned
+from terrafix_tools.autopilot_log.structure import Attitude, LogEvent, cleaned
 
 NS = 1_000_000_000
 
@@ -33,7 +33,7 @@ class FlightSide:
     end_s: float  # of the last message
     attitude: Attitude
     sent: Sent
-    events: list[Event]  # what Terrafix did to the autopilot
+    events: list[LogEvent]  # what Terrafix did to the autopilot
     gps_id: int  # configured instance of our GPS_INPUT; 0 is the first
 
 
@@ -71,7 +71,7 @@ def read_flight_side(path: Path) -> FlightSide:
         end_s=(last_ns - zero) / NS,
         attitude=cleaned(Attitude(*_columns(attitude, 4, zero))),
         sent=Sent(*_columns(sent, 5, zero)),
-        events=[Event((switch.t_ns - zero) / NS, "source", _switched(switch)) for switch in switches],
+        events=[LogEvent((switch.t_ns - zero) / NS, "source", _switched(switch)) for switch in switches],
         gps_id=int(result.header["config"].get("link", {}).get("gps_id", 0)),
     )
 

@@ -22,10 +22,10 @@ from terrafix_tools.autopilot_log.structure import (
     AutopilotLog,
     BodyRates,
     EkfTrack,
-    Event,
     Fusion,
     GlobalTrack,
     GpsTrack,
+    LogEvent,
     Origin,
     Series,
     Steps,
@@ -298,22 +298,24 @@ def _size(topic: _Topic) -> int:
     return len(topic["timestamp"])
 
 
-def _states(status: _Topic | None) -> list[Event]:
+def _states(status: _Topic | None) -> list[LogEvent]:
     if status is None:
         return []
     events = []
     modes = steps(_t_s(status), _integers(status, "nav_state"))
     if modes is not None:
         events += [
-            Event(float(t), "mode", _MODES.get(int(n), f"mode {int(n)}"))
+            LogEvent(float(t), "mode", _MODES.get(int(n), f"mode {int(n)}"))
             for t, n in zip(modes.t_s, modes.value, strict=True)
         ]
     armed = steps(_t_s(status), (_integers(status, "arming_state") == _ARMED).astype(float))
     if armed is not None:
         changed = zip(armed.t_s, armed.value, strict=True)
-        events += [Event(float(t), "arming", "armed" if n else "disarmed") for t, n in changed if n or t > armed.t_s[0]]
+        events += [
+            LogEvent(float(t), "arming", "armed" if n else "disarmed") for t, n in changed if n or t > armed.t_s[0]
+        ]
     return events
 
 
-def _texts(ulog: Any) -> list[Event]:
-    return [Event(text.timestamp * 1e-6, "message", text.message) for text in ulog.logged_messages]
+def _texts(ulog: Any) -> list[LogEvent]:
+    return [LogEvent(text.timestamp * 1e-6, "message", text.message) for text in ulog.logged_messages]

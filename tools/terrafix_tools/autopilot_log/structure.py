@@ -128,7 +128,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Event:
+class LogEvent:
     t_s: float
     kind: str  # "mode", "arming", "lane", "source set", "gps", "error", "event", "message"
     text: str
@@ -152,7 +152,7 @@ class AutopilotLog:
     source_set: Steps | None = None
     gps: list[GpsTrack] = field(default_factory=list)
     fusion: list[Fusion] = field(default_factory=list)
-    events: list[Event] = field(default_factory=list)
+    events: list[LogEvent] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)  # messages in the file, by type
     skipped_bytes: int = 0  # damaged or cut off
     notes: list[str] = field(default_factory=list)  # what was repaired, chosen and left out, in words
@@ -176,9 +176,9 @@ def value_at(found: Steps, at_s: np.ndarray) -> np.ndarray:
     return found.value[np.maximum(np.searchsorted(found.t_s, at_s, side="right") - 1, 0)]
 
 
-def changes(what: str, kind: str, found: Steps | None) -> list[Event]:
+def changes(what: str, kind: str, found: Steps | None) -> list[LogEvent]:
     """-> an event for each change after the first value: "lane 0 -> 1"."""
     if found is None:
         return []
     pairs = zip(found.t_s[1:], found.value[:-1], found.value[1:], strict=True)
-    return [Event(float(t), kind, f"{what} {old:g} -> {new:g}") for t, old, new in pairs]
+    return [LogEvent(float(t), kind, f"{what} {old:g} -> {new:g}") for t, old, new in pairs]

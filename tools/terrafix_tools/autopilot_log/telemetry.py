@@ -22,10 +22,10 @@ from terrafix_tools.autopilot_log.structure import (
     AutopilotLog,
     BodyRates,
     EkfTrack,
-    Event,
     Fusion,
     GlobalTrack,
     GpsTrack,
+    LogEvent,
     Origin,
     Series,
     cleaned,
@@ -197,26 +197,26 @@ def _mode(heartbeat: Any, firmware: str) -> str:
     return _PX4_MODES.get(main, f"mode {main}.{sub}")
 
 
-def _states(timed: _Timed, firmware: str) -> Iterator[Event]:
+def _states(timed: _Timed, firmware: str) -> Iterator[LogEvent]:
     """Modes and arming, at each change."""
     mode, armed = "", False
     for t_s, heartbeat in timed:
         now_armed = bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         if (now_mode := _mode(heartbeat, firmware)) != mode:
-            yield Event(t_s, "mode", now_mode)
+            yield LogEvent(t_s, "mode", now_mode)
         if now_armed != armed:
-            yield Event(t_s, "arming", "armed" if now_armed else "disarmed")
+            yield LogEvent(t_s, "arming", "armed" if now_armed else "disarmed")
         mode, armed = now_mode, now_armed
 
 
-def _texts(timed: _Timed) -> list[Event]:
+def _texts(timed: _Timed) -> list[LogEvent]:
     """Texts of more than 50 characters come in pieces with one id."""
-    events: list[Event] = []
+    events: list[LogEvent] = []
     for t_s, message in timed:
         text = message.text if isinstance(message.text, str) else message.text.decode("utf-8", "replace")
         text = text.split("\0")[0]
         if message.id and message.chunk_seq and events:
-            events[-1] = Event(events[-1].t_s, "message", events[-1].text + text)
+            events[-1] = LogEvent(events[-1].t_s, "message", events[-1].text + text)
         else:
-            events.append(Event(t_s, "message", text))
+            events.append(LogEvent(t_s, "message", text))
     return events

@@ -179,7 +179,8 @@ def results(
 
 @router.post("/flights/{flight_id}/user-fix", status_code=202)
 async def user_fix(request: Request, flight_id: FlightId, fix: UserFix) -> Steered:
-    """What a pixel of a frame shows lies there, to 5 m. Used as a prior: the map decides."""
+    """What a pixel of a frame shows lies there, to 5 m or ``sigma_m``. A measurement of the position, if the gate
+    accepts it; the search begins there, if the position is lost or unconfirmed."""
     return await service_of(request).steer(flight_id, fix)
 
 

@@ -189,6 +189,7 @@ class FlightGraph:
     held_out: list[Fix] = field(default_factory=list)  # map matches that the estimator was not given
     loops: list[LoopClosure] = field(default_factory=list)
     node_of: dict[int, int] = field(default_factory=dict)
+    fragment_of: dict[int, int] = field(default_factory=dict)  # of each frame
     refused: dict[str, int] = field(default_factory=dict)  # number of map matches that are not used, by verdict
     lost_sigma_m: dict[int, float] = field(default_factory=dict)  # node -> 1-sigma of a position that may be wrong
     radial_k1: tuple[float, float] = 0.0, 0.0  # final radial coefficient, and its 1-sigma
@@ -242,6 +243,7 @@ class FlightReplayer:
             flight.has_height = flight.has_height or message.agl_m is not None
         elif isinstance(message, Odometry) and any(isinstance(s, NavEstimate) for s in published):
             flight.node_of[message.frame_id] = flight.recorder.graph.newest
+            flight.fragment_of[message.frame_id] = message.fragment_id
             flight.recorder.add_triples(message)
             flight.features.add(message)
             flight.radial_k1 = estimator.state.radial_k1_estimate
@@ -265,7 +267,7 @@ class FlightReplayer:
     def _add_match(self, received: MapMatch, verdict: Verdict, estimator: Estimator) -> None:
         flight, fix = self.flights[-1], self._fix(received, estimator)
         if (node := flight.node_of.get(received.frame_id)) is not None:
-            flight.lost_sigma_m[node] = estimator.hypotheses.anywhere_m
+            flight.lost_sigma_m[node] = estimator.doubts.sigma_m
         if isinstance(fix, Verdict):
             flight.refused[str(fix)] = flight.refused.get(str(fix), 0) + 1
         else:

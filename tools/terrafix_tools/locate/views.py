@@ -23,15 +23,20 @@ from terrafix.estimator.state import (
 )
 from terrafix.messages import (
     CalibrationEstimate,
+    Camera,
     Frame,
     GroundPlane,
     MapMatch,
     NavEstimate,
     Odometry,
     Origin,
+    RefinedPose,
+    Refinement,
     VehicleState,
 )
 from terrafix.recorder.reader import ReadResult, check_format, read_flight
+from terrafix_tools.before_after import FINALISED
+from terrafix_tools.finalised import SUMMARY, read_flights, read_poses
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,8 @@ class FlightViews:
 
 
 def read_views(record: Path) -> FlightViews:
-    """Raises SourceError."""
+    """At the finalised pose of each frame, where there is one beside the record; else at the newest refined one; else
+    at its last estimate. Raises SourceError, EvaluationError."""
     result = ReadResult()
     origin: Origin | None = None
     frames: dict[int, Frame] = {}
@@ -92,6 +98,7 @@ def read_views(record: Path) -> FlightViews:
     grounds: dict[int, GroundPlane] = {}
     calibrations: list[CalibrationEstimate] = []
     triples: list[Odometry] = []
+    refined: dict[int, RefinedPose] = {}
     for _, _, message in read_flight(record, result):
         if isinstance(message, Origin):
             origin = message
@@ -107,6 +114,10 @@ def read_views(record: Path) -> FlightViews:
             calibrations.append(message)
         elif isinstance(message, Odometry) and message.three_view:
             triples.append(message)
+        elif isinstance(message, Refinement):
+            refined |= {
+                pose.frame_id: pose for pose in message.poses if pose.q_w_c is not None and pose.cov is not None
+            }
     check_format(record, result)
     if origin is None or not estimates:
         raise SourceError(f"{record}: the record has no position; was a flight recorded?")
@@ -117,7 +128,37 @@ def read_views(record: Path) -> FlightViews:
         for frame_id, estimate in estimates.items()
         if frame_id in frames
     }
+    for frame_id in views.keys() & refined.keys():
+        views[frame_id] = cameras.at(views[frame_id], refined[frame_id])
+    folder = record if record.is_dir() else record.parent
+    by_time = {round(view.t_ns * 1e-9, 3): frame_id for frame_id, view in views.items()}
+    lens = SolvedLens.of(read_flights(folder / SUMMARY), origin.camera)
+    for row in read_poses(folder):
+        if (finalised := by_time.get(round(row.t_s, 3))) is not None:
+            view = cameras.at(views[finalised], row.pose(finalised))
+            views[finalised] = view if lens is None else replace(view, calibration=lens.on(view.calibration))
     return FlightViews(origin, frame, views, triples, frames, result.header)
+
+
+@dataclass(frozen=True)
+class SolvedLens:
+    """Of a batch solution: focal length over the described one, and radial coefficient."""
+
+    focal_ratio: float
+    radial_k1: float
+
+    @classmethod
+    def of(cls, flights: list[dict[str, Any]], camera: Camera) -> "SolvedLens | None":
+        """``flights``: of finalised.json. None: no batch solution was kept, and heights are as seen through the
+        described lens."""
+        if len(flights) != 1 or flights[0].get("solution") != FINALISED:
+            return None
+        after = {row["what"]: row["after"] for row in flights[0]["before_after"]}
+        return cls(after["focal length"] / camera.fx, after["radial coefficient"])
+
+    def on(self, calibration: CameraCalibration) -> CameraCalibration:
+        fx, fy = self.focal_ratio * calibration.fx, self.focal_ratio * calibration.fy
+        return replace(calibration, fx=fx, fy=fy, radial_k1=self.radial_k1)
 
 
 class _Cameras:
@@ -166,6 +207,17 @@ class _Cameras:
             ground_m=ground_m,
             fragment_id=estimate.fragment_id,
         )
+
+    def at(self, view: CameraView, pose: RefinedPose) -> CameraView:
+        """``view`` at its refined ``pose``, which has an orientation and a covariance."""
+        assert pose.q_w_c is not None and pose.cov is not None
+        r_w_c, learnt, shift_m = rot_from_quat(pose.q_w_c), self._nearest(view.t_ns), np.zeros(2)
+        if learnt is not None:
+            lens = PrincipalPointFilter(self._camera, learnt.lens)
+            shift_m, _ = lens.shift(view.height_m * r_w_c[HORIZONTAL, HORIZONTAL])
+        e_m, n_m = np.array(self._frame.to_local(pose.lat_deg, pose.lon_deg)) - shift_m
+        up_m = view.p_c_in_w_m[UP] if pose.alt_amsl_m is None else pose.alt_amsl_m
+        return replace(view, p_c_in_w_m=np.array([e_m, n_m, up_m]), r_w_c=r_w_c, cov=np.reshape(pose.cov, (6, 6)))
 
     def _nearest(self, t_ns: int) -> CalibrationEstimate | None:
         if not self._calibrations:

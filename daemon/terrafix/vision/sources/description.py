@@ -7,6 +7,7 @@ import difflib
 import math
 import re
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,6 +17,7 @@ from msgspec import Meta
 from terrafix.core.errors import SourceError
 from terrafix.core.toml_file import read_toml
 from terrafix.messages import Camera, Origin
+from terrafix.vision.sources.fisheye import FULL_FOV_DEG, FisheyeCamera, view_of
 from terrafix.vision.sources.plausible import check_camera, check_centre
 
 if TYPE_CHECKING:
@@ -29,6 +31,11 @@ ATTITUDE_SIGMA_DEG = 2.0  # EKF attitude under acceleration
 # that was described by its field of view as a pinhole was 30 % off in a public data set.
 CALIBRATED_FOCAL_SIGMA, FOCAL_SIGMA = 0.01, 0.1
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)  # accepted by OpenCV's projectPoints
+FISHEYE_LENGTH = 4  # of cv2.fisheye
+NO_OMNIDIRECTIONAL = (
+    "omnidirectional lenses (omni, MEI, Scaramuzza's ocam, double sphere, EUCM) are not supported; calibrate the "
+    "lens as fisheye (Kalibr: pinhole-equi; OpenCV: cv2.fisheye; or `terrafix camera calibrate --model fisheye`)"
+)
 
 Positive = Annotated[float, Meta(gt=0)]
 Degrees = Annotated[float, Meta(ge=-360, le=360)]
@@ -39,7 +46,7 @@ class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class CameraTable(_Table, frozen=True, kw_only=True):
-    """Pinhole camera; all lengths in pixels of the stored frames."""
+    """All lengths in pixels of the stored frames; the middle of the first pixel is 0, 0."""
 
     width: Annotated[int, Meta(ge=16, le=65_535)]
     height: Annotated[int, Meta(ge=16, le=65_535)]
@@ -47,9 +54,12 @@ class CameraTable(_Table, frozen=True, kw_only=True):
     fy: Positive
     cx: float
     cy: float
-    model: Literal["pinhole"] = "pinhole"
+    model: Literal["pinhole", "fisheye"] = "pinhole"
     distortion: tuple[float, ...] = ()
     focal_sigma: Annotated[float, Meta(gt=0, le=0.5)] | None = None
+    fov_deg: Annotated[float, Meta(gt=0, le=360)] | None = (
+        None  # circle that a fisheye images, if smaller than the image
+    )
 
     @classmethod
     def of(cls, camera: Camera) -> "CameraTable":
@@ -63,6 +73,8 @@ class CameraTable(_Table, frozen=True, kw_only=True):
             cy=camera.cy,
             distortion=camera.distortion,
             focal_sigma=camera.focal_sigma,
+            model="fisheye" if isinstance(camera, FisheyeCamera) else "pinhole",
+            fov_deg=camera.fov_deg if isinstance(camera, FisheyeCamera) and camera.fov_deg < FULL_FOV_DEG else None,
         )
 
 
@@ -71,6 +83,16 @@ class MountTable(_Table, frozen=True, kw_only=True):
     pitch_deg: Degrees = -90.0
     roll_deg: Degrees = 0.0
     tolerance_deg: Annotated[float, Meta(gt=0, le=90)] = 5.0
+
+    @classmethod
+    def of(cls, camera: Camera) -> "MountTable":
+        """The table that describes the mount of this camera."""
+        return cls(
+            yaw_deg=camera.mount_yaw_deg,
+            pitch_deg=camera.mount_pitch_deg,
+            roll_deg=camera.mount_roll_deg,
+            tolerance_deg=camera.mount_tolerance_deg,
+        )
 
 
 class StartTable(_Table, frozen=True, kw_only=True):
@@ -122,6 +144,17 @@ def read_description(path: Path) -> Description:
         raise SourceError(f"{path}: {_explain(str(error))}") from None
     _check_numbers(path, table)
     camera = description.camera
+    if camera and camera.model == "fisheye" and len(camera.distortion) != FISHEYE_LENGTH:
+        raise SourceError(
+            f"{path}: [camera] distortion has {len(camera.distortion)} numbers; a fisheye has k1, k2, k3, k4"
+        )
+    if camera and camera.model == "fisheye" and camera.width / camera.fx > math.tau:
+        raise SourceError(
+            f"{path}: [camera] fx = {camera.fx:g} and {camera.width} px of a fisheye are more than half a turn off the "
+            "axis; give the focal length in pixels of the stored frames"
+        )
+    if camera and camera.model == "pinhole" and camera.fov_deg is not None:
+        raise SourceError(f'{path}: [camera] fov_deg is for model = "fisheye"; leave it out')
     if camera and len(camera.distortion) not in DISTORTION_LENGTHS:
         raise SourceError(
             f"{path}: [camera] distortion has {len(camera.distortion)} numbers; OpenCV takes 0, 4, 5, 8, 12 or 14"
@@ -134,11 +167,15 @@ def read_description(path: Path) -> Description:
 
 
 def camera_of(path: Path, description: Description) -> Camera:
-    """Camera and mount of the description in ``path``. Raises SourceError: no [camera], or implausible values."""
+    """Camera of the stored images, and mount, of the description in ``path``; a FisheyeCamera of a fisheye.
+
+    Raises SourceError: no [camera], or implausible values."""
     if description.camera is None:
         raise SourceError(f"{path}: there is no [camera]; add one with width, height, fx, fy, cx, cy in pixels")
     c, m = description.camera, description.mount
-    camera = Camera(
+    circle = FULL_FOV_DEG if c.fov_deg is None else c.fov_deg
+    kind = partial(FisheyeCamera, fov_deg=circle) if c.model == "fisheye" else Camera
+    camera = kind(
         width=c.width,
         height=c.height,
         fx=c.fx,
@@ -152,7 +189,7 @@ def camera_of(path: Path, description: Description) -> Camera:
         mount_roll_deg=m.roll_deg,
         mount_tolerance_deg=m.tolerance_deg,
     )
-    check_camera(path, camera)
+    check_camera(path, view_of(camera))
     return camera
 
 
@@ -223,5 +260,7 @@ def _explain(text: str) -> str:
     at = re.search(r"(.*) - at `\$\.?(\w*)\.?(.*)`", text)
     if not at:
         return text
+    if (at.group(2), at.group(3)) == ("camera", "model"):
+        return f'[camera] model: {at.group(1)}; write "pinhole" or "fisheye"; {NO_OMNIDIRECTIONAL}'
     place = f"[{at.group(2)}] {at.group(3)}" if at.group(3) else f"'{at.group(2)}'"
     return f"{place}: {at.group(1)[0].lower()}{at.group(1)[1:]}"

@@ -42,7 +42,7 @@ LAT, LON, ALT_M, EAST_MPS = 48.0, 11.0, 620.0, 20.0
 
 
 @dataclass
-class Result:
+class FuzzResult:
     """``wrong``: 3D fixes more than 5 m from the truth; ``false_states``: attitudes that were not sent."""
 
     bytes: int = 0
@@ -60,7 +60,7 @@ class Result:
     wire: dict[str, float] = field(default_factory=dict)
 
 
-def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) -> Result:
+def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) -> FuzzResult:
     """Simulates a flight of ``seconds``."""
     with tempfile.TemporaryDirectory() as folder:
         key = Path(folder) / "key"
@@ -69,7 +69,7 @@ def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) 
         loopback = Loopback()
         edge = MavlinkEdge(LinkSection(signing_key=str(key) if signed else ""), loopback, lambda: UNIX_NS)
     node, autopilot, rng = LinkNode(10.0), FuzzedAutopilot(signed), random.Random(seed)
-    result = Result(seconds=seconds, wire=asdict(wire))
+    result = FuzzResult(seconds=seconds, wire=asdict(wire))
     steps = round(seconds * TICK_HZ)
     delayed: list[bytes] = []
     last_sent_ns: int | None = None
@@ -133,7 +133,7 @@ def _true_state(state: VehicleState) -> bool:
     return all(a is not None and abs(a - b) < 1e-6 for a, b in zip(attitude, (YAW, PITCH, ROLL), strict=True))
 
 
-def _check_output(output: GpsInput, result: Result) -> None:
+def _check_output(output: GpsInput, result: FuzzResult) -> None:
     result.sent += 1
     if output.fix_type != 3:
         return
