@@ -339,8 +339,9 @@ class EstimatorNode:
             orientation = estimator.state.orientation.fault
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
-            # Turned or mirrored images move otherwise at any time, and those of no ground as anything.
-            if estimator.state.orientation.suspects or not frame.attitude.sees_ground:
+            # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground as anything.
+            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground
+            if estimator.state.orientation.suspects or untimed:
                 time_offset.forget_images()
             else:
                 time_offset.add(stamped, self._telemetry, agl_m)

@@ -16,6 +16,7 @@ from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
 from terrafix.messages import (
     CalibrationFault,
+    Frame,
     MapMatch,
     MeasurementVerdict,
     Message,
@@ -80,7 +81,7 @@ def flown(
     match of a frame of the fault has; None: it has none."""
     flight, run = simulated(seed), EstimatorRun()
     rng, result = np.random.default_rng([seed, 56]), WrongPictures()
-    run.feed([ORIGIN])
+    run.feed([ORIGIN, Frame(t_ns=0, frame_id=0, file="", width=1, height=1, buffered=True)])
     for i in range(frames):
         telemetry = [m for m in flight.messages_by_frame[i] if not isinstance(m, Odometry | MapMatch)]
         odometry, *found = images(
@@ -152,6 +153,7 @@ def test_a_frozen_picture_that_jitters_is_stalled_and_its_place_on_the_map_is_no
     assert [verdicts[i] for i in range(FIRST + 2, END)] == [Verdict.STALLED] * (END - FIRST - 2)
     predicted = {m.frame_id for m in result.published if isinstance(m, Prediction)}
     assert not predicted & set(range(FIRST + 2, END))
+    assert not [m for m in result.published if isinstance(m, CalibrationFault)]
     assert result.is_back(3.0)
 
 
