@@ -339,7 +339,7 @@ class EstimatorNode:
             orientation = estimator.state.orientation.fault
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
-            # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground as anything.
+            # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground anyhow.
             untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground
             if estimator.state.orientation.suspects or untimed:
                 time_offset.forget_images()
