@@ -86,7 +86,7 @@ def test_a_node_outside_the_process_table_is_an_error() -> None:
         InProcessShell({"foo": ReplyingNode("foo")}, lambda *_: None, table=TABLE)
 
 
-class ClosableEdge:
+class CountingEdge:
     """Reads one Frame at each poll, and keeps what it is given."""
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class ClosableEdge:
 
 def test_in_lockstep_an_edge_feeds_its_own_node_and_gets_what_that_receives_and_publishes() -> None:
     sunk: list[tuple[str, str]] = []
-    nodes, edge = {name: ReplyingNode(name) for name in ("first", "listener")}, ClosableEdge()
+    nodes, edge = {name: ReplyingNode(name) for name in ("first", "listener")}, CountingEdge()
     table = (Process("first", "", (m.Origin,), (m.MeasurementVerdict,), 10.0, 1.0), TABLE[2])
     shell = InProcessShell(
         nodes, lambda who, message: sunk.append((who, type(message).__name__)), edges={"first": edge}, table=table
@@ -120,7 +120,7 @@ def test_in_lockstep_an_edge_feeds_its_own_node_and_gets_what_that_receives_and_
 
 def test_an_edge_without_its_node_is_an_error() -> None:
     with pytest.raises(ValueError, match="not in the process table: first"):
-        InProcessShell({}, lambda *_: None, edges={"first": ClosableEdge()}, table=TABLE)
+        InProcessShell({}, lambda *_: None, edges={"first": CountingEdge()}, table=TABLE)
 
 
 def test_the_recorder_subscribes_to_every_message_type() -> None:
