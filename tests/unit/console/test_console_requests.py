@@ -54,6 +54,10 @@ def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
     assert answer.headers["location"] == f"/flights/{flight['flight_id']}"
     assert console.send("GET", answer.headers["location"]).json == flight
     assert flight in console.send("GET", "/flights").json["flights"]
+    config = console.send("GET", f"{answer.headers['location']}/config").json
+    assert config["flight"]["camera"]["fx"] == CAMERA["fx"] and config["flight"]["telemetry"]["yaw_sigma_deg"] == 5.0
+    assert (config["map"], config["config"]) == ("small", console.send("GET", "/config").json["flights"])
+    assert_refused(console.send("GET", f"/flights/{'0' * 16}/config"), 404)
     assert console.send("DELETE", answer.headers["location"]).status == 204
     assert_refused(console.send("GET", answer.headers["location"]), 404, flight["flight_id"])
 

@@ -208,6 +208,16 @@ class Flight(BaseModel):
     error: str = ""  # why the flight cannot be processed
 
 
+class FlightConfig(BaseModel):
+    """``flight``: as it was created, with defaults; empty for a live one, whose record has all of it. ``config``: the
+    effective configuration."""
+
+    flight_id: str
+    map: str
+    flight: dict[str, Any]
+    config: dict[str, Any]
+
+
 class Flights(BaseModel):
     flights: list[Flight]
 

@@ -11,6 +11,7 @@ from terrafix_tools.console.guard import COOKIE, token_of
 from terrafix_tools.console.payloads import (
     Accepted,
     Flight,
+    FlightConfig,
     Flights,
     Hint,
     MapInfo,
@@ -159,6 +160,12 @@ UPLOAD_BODY = {
 async def upload(request: Request, flight_id: FlightId) -> Accepted:
     """10 to 50 images, all of them or none. The same batch again gives the same answer."""
     return await service_of(request).upload(request, flight_id)
+
+
+@router.get("/flights/{flight_id}/config")
+def flight_config(request: Request, flight_id: FlightId) -> FlightConfig:
+    """What a flight was created with, and the configuration that computes it."""
+    return service_of(request).flight_config(flight_id)
 
 
 @router.get("/flights/{flight_id}/results")

@@ -24,6 +24,7 @@ from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
     Accepted,
     Flight,
+    FlightConfig,
     FlightKind,
     Flights,
     FlightState,
@@ -115,6 +116,12 @@ class Service:
     def flight(self, flight_id: str) -> Flight:
         with self.database.read() as db:
             return flights.flight_of(db, flight_id)
+
+    def flight_config(self, flight_id: str) -> FlightConfig:
+        with self.database.read() as db:
+            row = flights.row_of(db, flight_id)
+        spec = msgspec.json.decode(row.spec)
+        return FlightConfig(flight_id=flight_id, map=row.map_name, flight=spec, config=self.config()["flights"])
 
     def frame_image(self, flight_id: str, frame_id: int) -> Response:
         flight = self.flight(flight_id)

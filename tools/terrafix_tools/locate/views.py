@@ -151,7 +151,7 @@ class SolvedLens:
     def of(cls, flights: list[dict[str, Any]], camera: Camera) -> "SolvedLens | None":
         """``flights``: of finalised.json. None: no batch solution was kept, and heights are as seen through the
         described lens."""
-        if len(flights) != 1 or flights[0].get("solution") != FINALISED:
+        if len(flights) != 1 or flights[0].get("solution") != FINALISED or not flights[0]["before_after"]:
             return None
         after = {row["what"]: row["after"] for row in flights[0]["before_after"]}
         return cls(after["focal length"] / camera.fx, after["radial coefficient"])

@@ -71,7 +71,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunDir]:
 def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verdict) -> None:
     flying = HintListeners(run, verdict)
     try:
-        assert hint(48.1, -11.5, 3000.0) == "hint not used, 12 km from the estimate"
+        assert hint(48.1, -11.5, 3000.0, fix=(7, 5.5)) == "hint not used, 12 km from the estimate"
     finally:
         flying.land()
     (received,) = flying.hints
@@ -81,6 +81,7 @@ def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verd
         3000.0,
         "command line",
     )
+    assert (received.frame_id, received.sigma_m) == (7, 5.5)
 
 
 def test_without_a_frame_the_reply_states_that_the_hint_applies_to_the_next_one(
