@@ -63,7 +63,12 @@ class VelocityEvidence:
         state += gain * innovation[:, None]
         state[:, 0] -= moved_m
         self._state, self._cov = state, cov - gain[:, :, None] * cov[:, None, 0, :]
-        return np.asarray(-0.5 * distance2 - np.log(variance))
+        log = -0.5 * distance2 - np.log(variance)
+        # A larger velocity is rather a zoom or a squeezed image than a camera that is ever less late.
+        if log[RATES < 0.0].max() > log[0] + 1.0:  # nat: more than noise
+            self.forget()
+            return np.zeros(rates)
+        return np.asarray(np.where(RATES < 0.0, np.minimum(log, log[0]), log))
 
     def _mixed(self, share: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (R, 3) and covariances (R, 3, 3) at the beginning of the span, by the rate in it. ``share`` (R, R): of
