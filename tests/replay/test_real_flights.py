@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 DataSet = Callable[[str], Path]
 FIRST_FRAMES = 25
-HALF, QUARTER, WHOLE = 180, 90, 358  # frames of village-1; town-a has fewer
+HALF, THIRD, WHOLE = 180, 120, 358  # frames of village-1; town-a has fewer
 NAMES = ("village-1", "town-a")
 MAPS = {"village-1": "village-2014-01.tif", "town-a": "town.tif"}
 PEAK_MEMORY_MB = 1024.0
@@ -43,8 +43,8 @@ Fly = Callable[..., Flown]
 def fly(data_set: DataSet, tmp_path_factory: pytest.TempPathFactory) -> Fly:
     """``fly(name, map_name)``, ``fly(name, map_name, "xfeat")``: a flight, flown once whoever asks for it.
 
-    ``HALF`` of the flight over its own map without weights, a ``QUARTER`` with a model or over another map, or as many
-    frames as ``frames`` says; in a process of its own, whose peak memory is that of the flight."""
+    ``HALF`` of the flight over its own map, a ``THIRD`` over another map, or as many frames as ``frames`` says; in a
+    process of its own, whose peak memory is that of the flight."""
 
     @cache
     def flown(name: str, map_name: str, model: str, frames: int) -> Flown:
@@ -61,7 +61,7 @@ def fly(data_set: DataSet, tmp_path_factory: pytest.TempPathFactory) -> Fly:
         return flight, folder / "out", summary | evaluate(folder / "out", flight / "truth.csv")
 
     def fly(name: str, map_name: str, model: str = "", frames: int = 0) -> Flown:
-        return flown(name, map_name, model, frames or (QUARTER if model or map_name != MAPS[name] else HALF))
+        return flown(name, map_name, model, frames or (HALF if map_name == MAPS[name] else THIRD))
 
     return fly
 
@@ -217,7 +217,7 @@ def test_real_flights_meet_the_limits_with_xfeat(name: str, fly: Fly) -> None:
 
 def test_a_flight_on_a_map_of_another_season_has_no_false_fixes(fly: Fly) -> None:
     _, _, result = fly("village-1", "village-2014-03.tif")
-    assert result["frames"] == QUARTER
+    assert result["frames"] == THIRD
     assert result["within_50m"] >= 0.85
     assert result["false_fixes"] == 0
 
