@@ -68,9 +68,9 @@ class FlightFolder:
             *rate_facts(times_s, "frames"),
         ]
         if stated or self._log is None:
-            found += telemetry_facts(stated, "frames.csv")
+            found += telemetry_facts(stated, "frames.csv", self._origin)
         if self._log is not None:
-            found += telemetry_facts(self._log.states, self._log.path.name)
+            found += telemetry_facts(self._log.states, self._log.path.name, self._origin)
             found += log_facts(self._log, description.telemetry.tlog_t0_us is not None)
         outside = sum(not -1e9 <= state.t_ns <= self._rows[-1].t_ns for state in self._states)
         if outside and outside == len(self._states):
