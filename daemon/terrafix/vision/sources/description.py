@@ -116,7 +116,7 @@ class StartTable(_Table, frozen=True, kw_only=True):
 class TelemetryTable(_Table, frozen=True, kw_only=True):
     yaw_sigma_deg: Positive = YAW_SIGMA_DEG
     agl_sigma_m: Positive = AGL_SIGMA_M
-    attitude_sigma_deg: Positive = ATTITUDE_SIGMA_DEG
+    attitude_sigma_deg: Positive | None = None  # ATTITUDE_SIGMA_DEG, or what the source assumes
     tlog_t0_us: int | None = None  # UNIX microseconds of t_s = 0; absent: time of the first record of the log
     log_zero_s: float | None = None  # t_s = 0 on the clock of the autopilot's own log; absent: by the attitudes
     system_id: Annotated[int, Meta(ge=0, le=255)] = 0  # vehicle of the log; 0: the only one, or the only one that moves
@@ -213,9 +213,14 @@ def _gimbal(mount: MountTable) -> Gimbal | UnsetType:
     )
 
 
-def origin_of(description: Description, camera: Camera, start: tuple[float, float] | None) -> Origin:
+def origin_of(
+    description: Description,
+    camera: Camera,
+    start: tuple[float, float] | None,
+    attitude_sigma_deg: float = ATTITUDE_SIGMA_DEG,
+) -> Origin:
     """The flight's Origin at t 0. ``start`` (lat_deg, lon_deg) overrides [start]; without both, the initial position is
-    unknown (infinite sigma, ``core.initial_position``)."""
+    unknown (infinite sigma, ``core.initial_position``). ``attitude_sigma_deg``: where [telemetry] does not state it."""
     known = description.start is not None or start is not None
     lat_deg, lon_deg = (
         start if start else (description.start.lat_deg, description.start.lon_deg) if description.start else (0.0, 0.0)
@@ -236,7 +241,7 @@ def origin_of(description: Description, camera: Camera, start: tuple[float, floa
         start_sigma_m=description.start.sigma_m if description.start else START_SIGMA_M if known else math.inf,
         yaw_sigma_deg=description.telemetry.yaw_sigma_deg,
         agl_sigma_m=description.telemetry.agl_sigma_m,
-        attitude_sigma_deg=description.telemetry.attitude_sigma_deg,
+        attitude_sigma_deg=description.telemetry.attitude_sigma_deg or attitude_sigma_deg,
     )
 
 

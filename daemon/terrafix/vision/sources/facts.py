@@ -72,17 +72,18 @@ def rate_facts(times_s: Sequence[float], what: str) -> Iterator[Fact]:
         yield Fact("gaps", f"{len(gaps)} gaps between {what}, the longest {longest_s:.1f} s from {at_s:.1f} s on")
 
 
-def telemetry_facts(states: Sequence[VehicleState], whence: str) -> Iterator[Fact]:
-    """How often height, heading and tilt are stated. ``whence``: file or fields they come from."""
-    for topic, name in (
-        ("height", "agl_m"),
-        ("heading", "yaw_rad"),
-        ("tilt", "roll_rad"),
-        ("airspeed", "airspeed_mps"),
+def telemetry_facts(states: Sequence[VehicleState], whence: str, origin: Origin) -> Iterator[Fact]:
+    """How often height, heading and tilt are stated, and the accuracy that is assumed. ``whence``: file or fields they
+    come from."""
+    for topic, name, sigma in (
+        ("height", "agl_m", f", 1-sigma {origin.agl_sigma_m:g} m"),
+        ("heading", "yaw_rad", f", 1-sigma {origin.yaw_sigma_deg:g} degrees"),
+        ("tilt", "roll_rad", f", 1-sigma {origin.attitude_sigma_deg:g} degrees"),
+        ("airspeed", "airspeed_mps", ""),
     ):
         count = sum(getattr(state, name) is not None for state in states)
         if count or topic != "airspeed":
-            yield Fact(topic, f"{count} values from {whence}" if count else "not stated")
+            yield Fact(topic, f"{count} values from {whence}{sigma}" if count else "not stated")
 
 
 def log_facts(log: "TelemetryLog | OwnLog") -> Iterator[Fact]:

@@ -74,9 +74,9 @@ class FlightFolder:
             *rate_facts(times_s, "frames"),
         ]
         if self._stated or self._log is None:
-            found += telemetry_facts(self._stated, self._stated_in)
+            found += telemetry_facts(self._stated, self._stated_in, self._origin)
         if self._log is not None:
-            found += telemetry_facts(self._log.states, self._log.path.name)
+            found += telemetry_facts(self._log.states, self._log.path.name, self._origin)
             found += log_facts(self._log)
         outside = sum(not -1e9 <= state.t_ns <= self._rows[-1].t_ns for state in self._states)
         if outside and outside == len(self._states):

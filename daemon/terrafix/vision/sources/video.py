@@ -76,7 +76,7 @@ class Video:
             start_fact(self._origin, "--start" if self._start_given else f"[start] of {self._where.name}"),
             Fact("clock", "times of the container"),
             Fact("rate", f"{1 / self._period_s:g} images a second of {self._fps:.3g} ([source] rate_hz)"),
-            *telemetry_facts(self._states, "the telemetry beside the video"),
+            *telemetry_facts(self._states, "the telemetry beside the video", self._origin),
         ]
         if self._log is not None:
             found += log_facts(self._log)
