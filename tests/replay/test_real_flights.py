@@ -208,7 +208,7 @@ def test_the_batch_solution_is_no_farther_from_the_truth_than_refined_positions_
     assert farther_sigmas(noisy) > SIGNIFICANT  # the comparison would show it
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param("village-1", marks=pytest.mark.nightly), "town-a"])
 def test_real_flights_meet_the_limits_with_xfeat(name: str, fly: Fly) -> None:
     flight, out, result = fly(name, MAPS[name], "xfeat")
     check_floors(result, flight, out)

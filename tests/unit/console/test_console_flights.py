@@ -176,6 +176,7 @@ def flown_by(cluster: LocalCluster, data: Path, maps: Path, flight: Undisturbed)
         return stored(client, flight_id)
 
 
+@pytest.mark.nightly
 def test_a_cluster_whose_worker_is_killed_gives_the_results_and_events_of_this_computer(
     tmp_path: Path, maps: Path, undisturbed: Undisturbed
 ) -> None:

@@ -94,5 +94,5 @@ def test_the_refined_past_of_all_fragments_is_right_to_five_metres_in_the_median
 
 @pytest.mark.slow
 def test_the_covariance_of_refined_poses_holds_over_many_flights(flown: FragmentFlight) -> None:
-    nees = np.concatenate([flown.nees(), *(FragmentFlight(seed).nees() for seed in range(6) if seed != SEED)])
+    nees = np.concatenate([flown.nees(), *(FragmentFlight(seed).nees() for seed in range(3) if seed != SEED)])
     assert float(np.mean(nees < 5.991)) >= 0.93 and 0.3 < float(np.mean(nees)) < 2.6

@@ -238,6 +238,7 @@ def test_an_unmapped_slope_is_not_taken_for_a_tilt_of_the_camera() -> None:
     assert float((seen.nees < 5.991).mean()) > 0.93
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_three_view_constraints_reduce_the_drift_over_hills_without_a_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two flights over relief of 20 m, 150 s without a map."""
