@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 from terrafix.messages import Camera, Origin, VehicleState
 
 if TYPE_CHECKING:
+    from terrafix.core.autopilot_log.own_log import OwnLog
     from terrafix.core.mavlink.tlog import TelemetryLog
 
 GAP_TIMES = 3.0  # a gap is longer than this many times the median interval
@@ -85,10 +86,9 @@ def telemetry_facts(states: Sequence[VehicleState], whence: str, origin: Origin)
             yield Fact(topic, f"{count} values from {whence}{sigma}" if count else "not stated")
 
 
-def log_facts(log: "TelemetryLog", stated_zero: bool) -> Iterator[Fact]:
-    """Clock, vehicles and damage of a telemetry log."""
-    zero = "[telemetry] tlog_t0_us" if stated_zero else "the first record of the log"
-    yield Fact("clock", f"{log.path.name}: arrival times of its records; zero is {zero}")
+def log_facts(log: "TelemetryLog | OwnLog") -> Iterator[Fact]:
+    """Clock, vehicles and damage of a log."""
+    yield Fact("clock", f"{log.path.name}: {log.clock}; zero is {log.zero}")
     if len(log.vehicles) == 1:
         yield Fact("vehicles", log.vehicles[0].name())
     for note in log.notes():
@@ -97,5 +97,7 @@ def log_facts(log: "TelemetryLog", stated_zero: bool) -> Iterator[Fact]:
         yield Fact("left out", f"{log.path.name}: holds no attitude, height, heading or airspeed of an autopilot")
     if log.skipped_bytes:
         yield Fact("left out", f"{log.path.name}: {log.skipped_bytes} bytes are damaged or cut off")
+    if log.gimbal:
+        yield Fact("mount", f"{len(log.gimbal)} attitudes of a gimbal from {log.path.name}")
     if log.imu:
         yield Fact("inertial readings", f"{sum(len(batch.samples) for batch in log.imu)} from {log.path.name}")
