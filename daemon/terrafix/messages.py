@@ -14,6 +14,7 @@ Conventions
 from enum import StrEnum
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -54,6 +55,7 @@ class Verdict(StrEnum):
 
     ACCEPTED = "accepted"
     BAD_IMAGE = "bad_image"  # unreadable, truncated, wrong size
+    NO_GROUND = "no_ground"  # the gimbal holds the camera so flat that it sees no ground to match
     OVERTAKEN = "overtaken"  # left out: the computer was busy until a newer frame was there
     STALLED = "stalled"  # the camera repeats an earlier image while the vehicle moves
     NO_FEATURES = "no_features"  # no features to track
@@ -99,6 +101,14 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
 # --- from the source of a flight -----------------------------------------------------------------
 
 
+class Gimbal(msgspec.Struct, frozen=True, kw_only=True):
+    """Gimbal of the camera, which holds it as the mount says: level, image top forward, unless it reports otherwise."""
+
+    required: bool = True  # False: until it reports, the camera counts as fixed to the vehicle
+    device: int = 0  # number that it reports (GimbalAttitude); 0: the first that is heard
+    stabilised: tuple[str, ...] = ("roll", "pitch")  # axes that are level when nothing is reported
+
+
 class Camera(msgspec.Struct, frozen=True, kw_only=True):
     """Pinhole intrinsics for the stored frames (pixels) and orientation of the camera in the body (degrees)."""
 
@@ -114,6 +124,7 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True):
     mount_pitch_deg: float = -90.0  # straight down, image top forward
     mount_roll_deg: float = 0.0
     mount_tolerance_deg: float = 5.0  # 1-sigma of the true tilt about the nominal tilt
+    gimbal: Gimbal | UnsetType = UNSET  # the camera is on it; unset: fixed to the vehicle
 
 
 class Origin(Message, frozen=True, kw_only=True):
@@ -172,6 +183,14 @@ class Imu(Message, frozen=True, kw_only=True):
 
     source: str  # "mavlink"
     samples: list[ImuSample]
+
+
+class GimbalAttitude(Message, frozen=True, kw_only=True):
+    """Attitude of a gimbal, as it reports it."""
+
+    q: Quat  # from its axes (along the view, right, down) to north, east, down, or to heading, right, down
+    from_north: bool  # False: yaw is from the heading of the vehicle
+    device: int = 0  # gimbal_device_id, or component id of the gimbal; 0: the message names none
 
 
 class SourceEnded(Message, frozen=True, kw_only=True):
@@ -396,12 +415,15 @@ class SearchPlaces(Message, frozen=True, kw_only=True):
 class PositionHint(Message, frozen=True, kw_only=True):
     """A coarse position prior for the search, from the operator, or from the autopilot after a restart in flight.
 
-    ``radius_m``: 95 % radius about the given position, at ``t_ns``, the time at which the hint was given."""
+    ``radius_m``: 95 % radius about the given position, at ``t_ns``, the time at which the hint was given. A user fix is
+    also a measurement: the camera of ``frame_id`` is there, with ``sigma_m`` per axis."""
 
     lat_deg: float
     lon_deg: float
     radius_m: float
-    source: str  # "ground station 255", "command line", "autopilot"
+    source: str  # "ground station 255", "command line", "autopilot", "console"
+    frame_id: int = -1
+    sigma_m: float | None = None  # None: a coarse hint, which the search alone uses
 
 
 class EkfDeadReckoning(Message, frozen=True, kw_only=True):
@@ -479,6 +501,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     velocity_enu_mps: Vec3
     velocity_sigma_mps: float  # 1-sigma in the worst direction
     q_w_b: Quat
+    q_w_c: Quat | UnsetType = UNSET  # of a camera on a gimbal; unset: as q_w_b and the mount say
     cov: Mat6  # of the body pose
     map_sigma_m: float = 0.0  # part of cov: stated error of the map itself, 1-sigma per horizontal axis
     source_label: SourceLabel
@@ -602,7 +625,11 @@ class RefinementSource(StrEnum):
 
 
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
-    """Camera at frame ``frame_id``. ``cov_en_m2``: covariance of east and north."""
+    """Camera at frame ``frame_id``. ``cov_en_m2``: covariance of east and north.
+
+    ``cov``: position [m], then rotation [rad], world axes; its horizontal part is that of the sigmas. The estimator's
+    own refinement (FLIGHT) refines positions: the orientation is that with which the frame has left the window, and
+    the terms between both are zero."""
 
     frame_id: int
     lat_deg: float
@@ -612,8 +639,11 @@ class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
     sigma_n_m: float
     cov_en_m2: float = 0.0
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none, or unknown
-    q_w_c: Quat | None = None  # orientation of the camera; None: not refined
-    rotation_sigma_rad: Vec3 | None = None  # 1-sigma about east, north, up
+    q_w_c: Quat | None = None  # orientation of the camera; None, and ``cov``: of an earlier version
+    cov: Mat6 | None = None
+    # Metres of a unit of the submap of the frame: of odometry, in metres by the heights of the flight; None: no scale
+    # was estimated, and the one that an earlier Refinement states for this frame holds
+    m_per_unit: float | None = None
 
 
 class ClaimBudget(Message, frozen=True, kw_only=True):
@@ -639,8 +669,8 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
 
     frame_id: int  # -1: not related to a frame
     # From the estimator "odometry", "link" (odometry with one more keyframe), "map", "relocalization", "attitude" (the
-    # reported heading), "height", "airspeed", "dead_reckoning", "start", "reset" (of the graph); from the link
-    # "estimate", "telemetry", "wall clock"
+    # reported heading), "height", "airspeed", "dead_reckoning", "start", "reset" (of the graph), "user_fix"; from the
+    # link "estimate", "telemetry", "wall clock"
     measurement: str
     verdict: Verdict
     detail: str = ""
@@ -867,6 +897,7 @@ class Health(Message, frozen=True, kw_only=True):
     cause: str  # reason of the band
     power_w: float | None = None  # of the whole computer; None: no rail measures it
     clock_limit: float | None = None  # lowest ratio of limit_mhz and max_mhz over the processors; None: not readable
+    clock_mhz: float | None = None  # ... and limit_mhz of that processor
 
 
 class ProcessEvent(Message, frozen=True, kw_only=True):
@@ -910,6 +941,7 @@ AnyMessage = (
     | Frame
     | VehicleState
     | Imu
+    | GimbalAttitude
     | SourceEnded
     | Odometry
     | Relocalization

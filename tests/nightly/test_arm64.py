@@ -109,7 +109,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Vehicle:
+class EmulatedComputer:
     """The emulated computer: its root folder, whose /trial is ``work`` here."""
 
     root: Path
@@ -147,8 +147,8 @@ def table(folder: Path, request: pytest.FixtureRequest) -> Table:
 
 
 @pytest.fixture(scope="module")
-def debian(folder: Path, table: Table) -> Vehicle:
-    vehicle = Vehicle(folder / "root", folder / "work")
+def debian(folder: Path, table: Table) -> EmulatedComputer:
+    vehicle = EmulatedComputer(folder / "root", folder / "work")
     with table.row("Debian by debootstrap") as seen:
         if platform.machine() != "x86_64":
             pytest.skip(f"ARM64: compares an emulated computer with an x86-64 one, and this is {platform.machine()}")
@@ -178,7 +178,7 @@ def of_the_vehicle() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def vehicle(debian: Vehicle, table: Table) -> Vehicle:
+def vehicle(debian: EmulatedComputer, table: Table) -> EmulatedComputer:
     """With Terrafix installed by install.sh from its wheel, as on a vehicle without a network."""
     wheels, lock, made = debian.root / "opt" / "wheels", ROOT / "requirements.lock", debian.root / "opt" / "installed"
     with table.row("wheels of aarch64") as seen:
@@ -212,7 +212,7 @@ def vehicle(debian: Vehicle, table: Table) -> Vehicle:
 
 
 @pytest.fixture(scope="module")
-def tree(vehicle: Vehicle, table: Table) -> Vehicle:
+def tree(vehicle: EmulatedComputer, table: Table) -> EmulatedComputer:
     """With the tests and what they need beside Terrafix, at the end of the path: what is installed comes first."""
     with table.row("tests and the extra `ground`") as seen:
         extra = vehicle.root / "opt" / "extra"
@@ -234,7 +234,7 @@ def tree(vehicle: Vehicle, table: Table) -> Vehicle:
     return vehicle
 
 
-def test_all_packages_are_imported(vehicle: Vehicle, table: Table) -> None:
+def test_all_packages_are_imported(vehicle: EmulatedComputer, table: Table) -> None:
     with table.row("import of all packages") as seen:
         said = vehicle.do(PYTHON, "-c", IMPORTS).splitlines()[-1]
         seen.append(said)
@@ -242,18 +242,18 @@ def test_all_packages_are_imported(vehicle: Vehicle, table: Table) -> None:
 
 
 @pytest.mark.parametrize("area", FAST_TESTS)
-def test_the_fast_tests_pass(tree: Vehicle, table: Table, area: str) -> None:
+def test_the_fast_tests_pass(tree: EmulatedComputer, table: Table, area: str) -> None:
     with table.row(f"fast tests of {area}") as seen:
         seen.append(tests_there(tree, f"tests/unit/{area}", PROCESSOR))
 
 
-def test_no_false_floating_point_flags_with_sve(tree: Vehicle, table: Table) -> None:
+def test_no_false_floating_point_flags_with_sve(tree: EmulatedComputer, table: Table) -> None:
     """Of the emulator's largest processor: matrix products of float32 set them, and warnings are errors in tests."""
     with table.row("repeated pictures with SVE") as seen:
         seen.append(tests_there(tree, "tests/unit/vision/test_repeated_picture.py", "max"))
 
 
-def tests_there(tree: Vehicle, path: str, processor: str) -> str:
+def tests_there(tree: EmulatedComputer, path: str, processor: str) -> str:
     """-> the last line of pytest. Raises AssertionError with its output if a test has failed."""
     chosen = ("-m", "not slow and not real_time and not nightly", "-k", f"not ({' or '.join(NOT_EMULATED)})", path)
     pytest_there = f'cd /opt/tree && exec {PYTHON} -m pytest -q -p no:cacheprovider "$@"'
@@ -266,7 +266,7 @@ def tests_there(tree: Vehicle, path: str, processor: str) -> str:
 
 
 def test_map_and_answers_are_those_of_this_computer(
-    tree: Vehicle, table: Table, data_set: Callable[[str], Path]
+    tree: EmulatedComputer, table: Table, data_set: Callable[[str], Path]
 ) -> None:
     """Each processor builds its map and replays the same frames over it."""
     flight, tif = data_set("flights/village-1"), data_set("maps/village-2014-01.tif")
@@ -331,7 +331,9 @@ def surroundings(folder: Path) -> Iterator[Surroundings]:
         yield running
 
 
-def test_it_flies_with_the_simulated_autopilot(vehicle: Vehicle, surroundings: Surroundings, table: Table) -> None:
+def test_it_flies_with_the_simulated_autopilot(
+    vehicle: EmulatedComputer, surroundings: Surroundings, table: Table
+) -> None:
     """The link sends no fix by an estimate older than 2 s, as an emulated one is: the record has the estimates."""
     with table.row("terrafix run with the autopilot") as seen:
         surroundings.prepare(vehicle.root)
@@ -384,7 +386,9 @@ def end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def test_the_unit_is_active_in_a_booted_systemd(vehicle: Vehicle, surroundings: Surroundings, table: Table) -> None:
+def test_the_unit_is_active_in_a_booted_systemd(
+    vehicle: EmulatedComputer, surroundings: Surroundings, table: Table
+) -> None:
     with table.row("the unit in a booted systemd") as seen:
         if not shutil.which("systemd-nspawn"):
             pytest.skip("ARM64 MISSING: systemd-nspawn (apt install systemd-container)")

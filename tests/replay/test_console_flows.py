@@ -42,7 +42,7 @@ MIDDLE = PixelPoint(u=639.5, v=359.5)
 
 
 @dataclass
-class Recorded:
+class RecordedVillage:
     """village-1: rows of frames.csv and truth.csv."""
 
     folder: Path
@@ -50,7 +50,7 @@ class Recorded:
     truth: list[dict[str, str]]
 
     @classmethod
-    def read(cls, folder: Path) -> "Recorded":
+    def read(cls, folder: Path) -> "RecordedVillage":
         tables = [
             list(csv.DictReader(io.StringIO((folder / name).read_text("utf-8"))))
             for name in ("frames.csv", "truth.csv")
@@ -74,10 +74,10 @@ class Recorded:
 
 
 @dataclass
-class Flown:
+class HttpFlight:
     """A flight over HTTP. ``frames``: recorded frame of each uploaded one."""
 
-    recorded: Recorded
+    recorded: RecordedVillage
     client: ConsoleClient
     flight_id: str
     frames: list[int] = field(default_factory=list)
@@ -126,8 +126,8 @@ class Flown:
 
 
 @pytest.fixture(scope="module")
-def recorded(data_set: Callable[[str], Path]) -> Recorded:
-    return Recorded.read(data_set("flights/village-1"))
+def recorded(data_set: Callable[[str], Path]) -> RecordedVillage:
+    return RecordedVillage.read(data_set("flights/village-1"))
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +142,7 @@ def sources(data_set: Callable[[str], Path], tmp_path_factory: pytest.TempPathFa
 class Helped:
     """What was seen of a flight that knew neither its start nor its headings, began beside the map and was helped."""
 
-    flown: Flown
+    flown: HttpFlight
     health: Any
     created: Flight
     map_info: Any
@@ -158,7 +158,7 @@ class Helped:
 
 
 @pytest.fixture(scope="module")
-def helped(recorded: Recorded, sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Helped]:
+def helped(recorded: RecordedVillage, sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Helped]:
     served = Served(tmp_path_factory.mktemp("helped"), sources=sources)
     try:
         yield help_flight(served, recorded)
@@ -167,11 +167,11 @@ def helped(recorded: Recorded, sources: Path, tmp_path_factory: pytest.TempPathF
         served.process.wait()
 
 
-def help_flight(served: Served, recorded: Recorded) -> Helped:
+def help_flight(served: Served, recorded: RecordedVillage) -> Helped:
     client = served.client
     health = served.get("/health").json
     created = client.create(recorded.new(CORRIDOR_M, None))
-    flown = Flown(recorded, client, created.flight_id)
+    flown = HttpFlight(recorded, client, created.flight_id)
     accepted = [flown.upload(OFF_ROUTE, headings=False)]  # while the map is made
     needed = flown.watched.until("user_input_needed")
     flown.watched.until("frame_processed", frame_id=len(OFF_ROUTE) - 1)
@@ -288,12 +288,12 @@ def test_the_service_ends_in_order(helped: Helped) -> None:
 
 @pytest.mark.nightly
 def test_a_flight_that_is_stopped_goes_on_and_a_fragment_is_merged_by_a_match_in_the_background(
-    recorded: Recorded, sources: Path, tmp_path: Path
+    recorded: RecordedVillage, sources: Path, tmp_path: Path
 ) -> None:
     """The first photos follow the route; the next ones begin beside the map, unconnected, and come back to it."""
     served = Served(tmp_path, sources=sources)
     try:
-        flown = Flown(recorded, served.client, served.client.create(recorded.new(CORRIDOR_M, BEGIN[0])).flight_id)
+        flown = HttpFlight(recorded, served.client, served.client.create(recorded.new(CORRIDOR_M, BEGIN[0])).flight_id)
         flown.upload(BEGIN)
         flown.watched.until("frame_processed", frame_id=2)
         assert served.stop() == 0
@@ -323,11 +323,11 @@ def test_a_flight_that_is_stopped_goes_on_and_a_fragment_is_merged_by_a_match_in
 
 @pytest.mark.nightly
 def test_a_search_around_a_wrong_hint_widens_until_it_has_the_place(
-    recorded: Recorded, sources: Path, tmp_path: Path
+    recorded: RecordedVillage, sources: Path, tmp_path: Path
 ) -> None:
     served = Served(tmp_path, sources=sources)
     try:
-        flown = Flown(recorded, served.client, served.client.create(recorded.new(3 * CORRIDOR_M, None)).flight_id)
+        flown = HttpFlight(recorded, served.client, served.client.create(recorded.new(3 * CORRIDOR_M, None)).flight_id)
         lat, lon = recorded.place(WRONG_HINT)
         served.client.hint(flown.flight_id, Hint(lat=lat, lon=lon, radius_m=100.0))
         flown.upload(range(48, 108, 6))

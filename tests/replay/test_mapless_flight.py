@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapless_flight import Flown, darkened, fly
+from mapless_flight import MaplessFlight, darkened, fly
 from terrafix.core.gate import GATE
 from terrafix.messages import Verdict
 from terrafix.vision.sources import Shot
@@ -45,12 +45,12 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def drift_m(flown: Flown, frame_id: int) -> float:
+def drift_m(flown: MaplessFlight, frame_id: int) -> float:
     """Error of the motion since the first frame, whose position only the operator has stated."""
     return float(np.linalg.norm(flown.error_m(frame_id) - flown.error_m(min(flown.truth_m))))
 
 
-def assert_no_estimate_is_worse_than_its_covariance(flown: Flown) -> None:
+def assert_no_estimate_is_worse_than_its_covariance(flown: MaplessFlight) -> None:
     nees = [
         flown.error_m(i) @ np.linalg.solve(flown.cov_m2(i), flown.error_m(i))
         for i in flown.truth_m
@@ -59,6 +59,7 @@ def assert_no_estimate_is_worse_than_its_covariance(flown: Flown) -> None:
     assert max(nees) < GATE[2]
 
 
+@pytest.mark.nightly
 def test_at_the_end_of_a_second_lap_the_position_relative_to_the_start_is_known_to_a_third_of_a_percent_of_the_way(
     loop: Path,
 ) -> None:

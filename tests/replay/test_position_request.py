@@ -102,6 +102,7 @@ class AskedOperator:
         )
 
 
+@pytest.mark.nightly
 def test_after_a_fifth_of_the_route_without_a_fix_the_operator_is_asked_and_the_hint_is_used(
     data_set: Callable[[str], Path], tmp_path: Path
 ) -> None:

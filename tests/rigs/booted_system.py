@@ -20,7 +20,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, NavEstimate
 from terrafix.processes import PROCESSES
 from terrafix_lab.chaos.camera import StreamedCamera, camera_toml
-from terrafix_lab.chaos.scene import Scene
+from terrafix_lab.chaos.scene import ChaosScene
 from terrafix_lab.chaos.verdict import back_s
 from terrafix_lab.faults.pictures import halved
 from terrafix_lab.sim.autopilot.course import PeerState
@@ -41,7 +41,7 @@ def do(*command: str | Path, limit_s: float = INSTALL_S) -> str:
 class Surroundings:
     """Camera and autopilot of the shuttle on the loopback of this computer. A context manager."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: ChaosScene) -> None:
         ground = scene.course(0.0)
         self.scene, self.stream = scene, FrameStream()
         self.peer = AutopilotPeer(kind=Kind.COPTER, home_amsl_m=ground.amsl_m - ground.agl_m)
@@ -103,7 +103,7 @@ def shrunk(jpeg: bytes) -> bytes:
     return cv2.imencode(".jpg", halved(image))[1].tobytes()
 
 
-def slower(scene: Scene, times: float, folder: Path) -> Scene:
+def slower(scene: ChaosScene, times: float, folder: Path) -> ChaosScene:
     """The same flight, ``times`` as slow, and as many images, of half the width and height, which are written into
     ``folder``: for a computer that needs longer for each."""
     folder.mkdir(exist_ok=True)

@@ -167,13 +167,14 @@ FLIGHT_INPUTS: tuple[Row, ...] = (
         "XMP of DJI (gimbal), Autel and Pix4D (Camera), Parrot",
         "degrees",
         "true north; DJI: pitch from the horizon; Pix4D: from straight down, below -45 from the horizon",
-        "0/0/0, and a heading of zero in all photos: not reported",
+        "1-sigma of the tilt 9 degrees, unless flight.toml says it; 0/0/0, headings that are all zero: not reported",
         "-",
         (
             "vision/test_photo_makers.py",
             (
                 "test_attitudes_of_several_makers_are_those_of_one_vehicle",
                 "test_gimbal_angles_of_zero_leave_the_flights_heading_and_a_wide_mount",
+                "test_a_stated_accuracy_of_the_tilt_replaces_that_of_photos",
                 "test_what_is_exactly_zero_in_all_photos_is_not_reported",
             ),
         ),

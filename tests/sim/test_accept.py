@@ -95,6 +95,7 @@ def test_a_shifted_map_is_generated_flown_and_evaluated_with_the_rows_of_false_i
     assert done.returncode == (1 if table["broken"] else 0), done.stderr
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_frozen_camera_during_a_gnss_jam_does_not_move_the_aircraft_off_its_path(
     resumed: Resumed, tmp_path: Path

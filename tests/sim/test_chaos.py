@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from terrafix_lab.chaos.run import fly_cell
-from terrafix_lab.chaos.scene import Scene, course_of
+from terrafix_lab.chaos.scene import ChaosScene, course_of
 from terrafix_lab.faults.fault import Phase
 from terrafix_lab.faults.processes import killed
 from terrafix_lab.sim.autopilot.parameters import Kind
@@ -21,14 +21,14 @@ RESTART_LIMIT_S = 4.0
 BUSY = 2.0  # load average a core; Terrafix alone is below 1
 
 
-def small_scene(folder: Path) -> Scene:
+def small_scene(folder: Path) -> ChaosScene:
     place = world.generate(SEED, width_m=SIDE_M, height_m=SIDE_M)
     write_map(place, folder / "map.gpkg")
     ground = scene_of_place(place, CAMERA_SEASON)
     flight = flight_over(ground, Kind.COPTER, seed=SEED, duration_s=DURATION_S, agl_m=AGL_M)
     write_flight(folder, flight, "map.gpkg", seed=SEED, telemetry=False)
     jpegs = sorted((folder / "frames").glob("*.jpg"))
-    return Scene(folder / "map.gpkg", jpegs, course_of(flight, folder), {Phase.START: 1.0}, DURATION_S)
+    return ChaosScene(folder / "map.gpkg", jpegs, course_of(flight, folder), {Phase.START: 1.0}, DURATION_S)
 
 
 def test_the_link_killed_before_the_first_fix_comes_back_with_a_right_position(

@@ -1,7 +1,7 @@
 """Rig of the PX4 tests: PX4's firmware with its own simulator (SIH), a ground station that flies it, and the real edge
 and node of the link, fed with estimates made from the simulator's truth.
 
-``Flight.step`` runs all of it: it receives from the firmware on both links and sends what is due."""
+``Px4Flight.step`` runs all of it: it receives from the firmware on both links and sends what is due."""
 
 import contextlib
 import fcntl
@@ -120,7 +120,7 @@ class Errors:
     silent: bool = False  # no estimates
 
 
-class Flight:
+class Px4Flight:
     """One flight, run by ``step``.
 
     ``newest``: the newest MAVLink message of each type; ``texts``: STATUSTEXT with its time; ``published``: messages of

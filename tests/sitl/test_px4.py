@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from px4 import AUTO, HOME, HOVER_M, LAND, LOITER, NO_GPS, OURS, WAYPOINT_M, Flight, px4
+from px4 import AUTO, HOME, HOVER_M, LAND, LOITER, NO_GPS, OURS, WAYPOINT_M, Px4Flight, px4
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix import messages as m
@@ -23,16 +23,16 @@ FAR_M = 1e6
 
 
 @contextmanager
-def px4_flight(folder: Path, parameters: dict[str, float], *outputs: str) -> Iterator[Flight]:
+def px4_flight(folder: Path, parameters: dict[str, float], *outputs: str) -> Iterator[Px4Flight]:
     with px4(folder, parameters) as ports:
-        flight = Flight(ports, outputs)
+        flight = Px4Flight(ports, outputs)
         try:
             yield flight
         finally:
             flight.close()
 
 
-def print_errors(flight: Flight, since_s: float, what: str) -> None:
+def print_errors(flight: Px4Flight, since_s: float, what: str) -> None:
     """Prints the horizontal error of the EKF since ``since_s``."""
     errors_m = sorted(x for s, x, _ in flight.errors_m if s >= since_s and not math.isnan(x))
     sys.stdout.write(

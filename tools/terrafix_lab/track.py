@@ -59,7 +59,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Criterion:
+class TrackCriterion:
     """``of``: what is shown of several flights."""
 
     what: str
@@ -69,10 +69,10 @@ class Criterion:
 
 
 CRITERIA = {
-    "late sure over 20 m": Criterion(
+    "late sure over 20 m": TrackCriterion(
         "positions beyond 20 m and 3 sigma, later than 3 s and 5 frames into the fault", "",
         lambda track: float(track.is_late(LATE_M).sum()), sum),
-    "right again": Criterion(
+    "right again": TrackCriterion(
         "from the end of the fault until within 20 m and claimed to 30 m (95 %), three in a row", "s", Track.again_s),
 }  # fmt: skip
 

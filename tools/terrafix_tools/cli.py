@@ -5,6 +5,7 @@ import errno
 import importlib
 import importlib.util
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -28,7 +29,7 @@ EXTRAS = {
         "fastapi", "starlette", "uvicorn", "sqlalchemy", "python_multipart", "pydantic",
         "terrafix_tools.console",
     ),
-    "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "terrafix_"),
+    "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "yaml", "terrafix_"),
 }  # fmt: skip
 # a full disk, or one over its quota
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
@@ -41,6 +42,7 @@ MODULES = {
     "hint": "terrafix_tools.hint.cli:hint",
     "log": "terrafix_tools.log.cli:app",
     "source": "terrafix_tools.source.cli:app",
+    "camera": "terrafix_tools.camera.cli:app",
     "files": "terrafix_tools.files.cli:files",
     "models": "terrafix_tools.models.cli:app",
     "map": "terrafix_tools.mapping.cli:app",
@@ -56,6 +58,16 @@ MODULES = {
     "montecarlo": "terrafix_lab.montecarlo.cli:montecarlo",
     "chaos": "terrafix_lab.chaos.cli:chaos",
     "bench": "terrafix_lab.bench.cli:bench",
+}
+
+# Of the help, in the order of a flight. A command that is in none is a mistake (tests/unit/project/test_cli_help.py).
+GROUPS = {
+    "Fly": ("run", "status", "hint"),
+    "Before a flight": ("preflight", "camera", "source", "files", "models"),
+    "After a flight": ("replay", "report", "evaluate", "finalise", "log", "compare", "locate", "fleet"),
+    "Photos and flights over HTTP": ("serve", "flight"),
+    "Maps": ("map",),
+    "Simulate and measure": ("demo", "sim", "accept", "montecarlo", "chaos", "bench"),
 }
 
 
@@ -83,13 +95,26 @@ class _Commands(typer.core.TyperGroup):
     """The commands of this module and those of MODULES; the help leaves out what is not installed."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*super().list_commands(ctx), *(name for name, path in MODULES.items() if _is_installed(path))]
+        installed = {*super().list_commands(ctx), *(name for name, path in MODULES.items() if _is_installed(path))}
+        return [name for names in GROUPS.values() for name in names if name in installed]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        return _load(cmd_name) if cmd_name in MODULES else super().get_command(ctx, cmd_name)
+        command: Any = _load(cmd_name) if cmd_name in MODULES else super().get_command(ctx, cmd_name)
+        if command is not None:
+            command.rich_help_panel = next((group for group, names in GROUPS.items() if cmd_name in names), None)
+            _show_brackets(command)
+        return command
 
 
-app = typer.Typer(no_args_is_help=True, cls=_Commands)
+def _show_brackets(command: Any) -> None:
+    """Brackets in the help of ``command`` and of those below it are text: Rich would take "[source]" for markup."""
+    for item in (command, *command.params):
+        item.help = re.sub(r"\[(?=[a-z#/@])", r"\\[", item.help) if getattr(item, "help", None) else None
+    for below in getattr(command, "commands", {}).values():
+        _show_brackets(below)
+
+
+app = typer.Typer(no_args_is_help=True, cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 
 StartOption = Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")]
 ConfigOption = Annotated[list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")]

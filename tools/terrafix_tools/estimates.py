@@ -9,7 +9,7 @@ from typing import TextIO
 
 from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import rot_from_quat, yaw_of
-from terrafix.messages import Frame, Message, NavEstimate, Refinement
+from terrafix.messages import Frame, Message, NavEstimate, RefinedPose, Refinement
 
 
 @dataclass
@@ -34,6 +34,11 @@ class Row:
     process_ms: float | None = None
     refined_lat_deg: float | None = None
     refined_lon_deg: float | None = None
+    refined_alt_amsl_m: float | None = None
+    refined_q_w_c: str = ""
+    refined_cov: str = ""
+    refined_m_per_unit: float | None = None
+    refined_fragment_id: int | None = None
 
     @property
     def localised(self) -> bool:
@@ -56,8 +61,11 @@ DIGITS: dict[str, int] = {
     "process_ms": 1,
     "refined_lat_deg": 8,
     "refined_lon_deg": 8,
+    "refined_alt_amsl_m": 3,
+    "refined_m_per_unit": 4,
 }
-_TEXT = ("file", "source_label", "covariance_mode")
+_TEXT = ("file", "source_label", "covariance_mode", "refined_q_w_c", "refined_cov")
+_INTEGERS = ("anchor_age_ms", "refined_fragment_id")
 _REQUIRED = ("file", "lat_deg", "lon_deg", "sigma_e_m", "sigma_n_m", "cov_en_m2")
 NS = 1_000_000_000
 ESTIMATES = "estimates.csv"
@@ -84,8 +92,15 @@ class RowTable:
         elif isinstance(message, Refinement):
             for pose in message.poses:
                 if pose.frame_id in self.rows:
-                    row = self.rows[pose.frame_id]
-                    row.refined_lat_deg, row.refined_lon_deg = pose.lat_deg, pose.lon_deg
+                    self._refined(self.rows[pose.frame_id], pose)
+
+    @staticmethod
+    def _refined(row: Row, pose: RefinedPose) -> None:
+        row.refined_lat_deg, row.refined_lon_deg, row.refined_alt_amsl_m = pose.lat_deg, pose.lon_deg, pose.alt_amsl_m
+        row.refined_q_w_c, row.refined_cov = numbers(pose.q_w_c or ()), numbers(pose.cov or ())
+        row.refined_fragment_id = pose.fragment_id
+        if pose.m_per_unit is not None:
+            row.refined_m_per_unit = pose.m_per_unit
 
     @staticmethod
     def _estimate(row: Row, estimate: NavEstimate) -> None:
@@ -98,6 +113,11 @@ class RowTable:
         row.yaw_deg = yaw_deg_of(estimate)
         row.source_label, row.covariance_mode = str(estimate.source_label), str(estimate.covariance_mode)
         row.anchor_age_ms = estimate.last_anchor_age_ms
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Several numbers as one cell, with six significant digits."""
+    return " ".join(f"{value:.6g}" for value in values)
 
 
 def cells(row: Row) -> list[str]:
@@ -131,7 +151,7 @@ def read_rows(path: Path) -> list[Row]:
             if name in _TEXT:
                 setattr(row, name, text)
             elif (value := number(path, line, name, text)) is not None:
-                setattr(row, name, int(value) if name == "anchor_age_ms" else value)
+                setattr(row, name, int(value) if name in _INTEGERS else value)
         rows.append(row)
     return rows
 

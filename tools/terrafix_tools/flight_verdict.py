@@ -20,17 +20,18 @@ MAX_UNCONFIRMED_S = DEGRADATION_LEVELS[1][
 ]  # time that a flight may last on its initial position before a map match confirms it
 MAX_UNANCHORED_S = DEGRADATION_LEVELS[-1][0]  # longest time without a map match later on
 MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejected by the estimator's innovation gate
-# One of map and initial position is wrong; no measurement on board decides which.
 # Faults that begin in flight; all others are of the description, which was wrong from the beginning.
 BEGIN_IN_FLIGHT = ("registration", "picture upside down", "picture turned", "picture mirrored")
+# One of map and initial position is wrong; no measurement on board decides which.
 START_CONTRADICTS_MAP = "start and map contradict each other: one of them is in the wrong place"
 MAX_SHOWN_SPANS = 3
 
 
 @dataclass(frozen=True)
 class FlightVerdict:
-    """``spans``: (from, to) in seconds, in the time of the rows, that can be trusted. ``reasons``: why the rest
-    cannot.
+    """``spans``: (from, to) in seconds, in the time of the rows, that can be trusted. ``reasons``: why the rest cannot.
+    ``files``, ``untrusted_files``: first and last image of each span, and of each one between them; empty names where
+    images have none.
     """
 
     spans: list[tuple[float, float]]
@@ -38,6 +39,8 @@ class FlightVerdict:
     reasons: list[str]
     active_faults: list[str]  # at the end of the flight
     cause: str = ""  # the likely one, of a flight that found nothing on the map
+    files: tuple[tuple[str, str], ...] = ()
+    untrusted_files: tuple[tuple[str, str], ...] = ()
 
     @property
     def label(self) -> str:
@@ -51,7 +54,11 @@ class FlightVerdict:
         cause = f" Likely cause: {self.cause}." if self.cause else ""
         if not self.spans or self.share == 1.0:
             return f"{self.label.capitalize()}{because}.{cause}"
-        shown = ", ".join(f"from {a:.1f} s to {b:.1f} s" for a, b in self.spans[:MAX_SHOWN_SPANS])
+        names = self.files or (("", ""),) * len(self.spans)
+        shown = ", ".join(
+            f"from {_moment(a, first)} to {_moment(b, last)}"
+            for (a, b), (first, last) in zip(self.spans[:MAX_SHOWN_SPANS], names, strict=False)
+        )
         more = len(self.spans) - MAX_SHOWN_SPANS
         others = f" and in {more} more spans" if more > 0 else ""
         return f"Trust it {shown}{others}, and no more than that{because}.{cause}"
@@ -61,6 +68,8 @@ class FlightVerdict:
         return {
             "verdict": self.label,
             "trusted_s": [[round(a, 3), round(b, 3)] for a, b in self.spans],
+            "trusted_files": [list(pair) for pair in self.files],
+            "untrusted_files": [list(pair) for pair in self.untrusted_files],
             "trusted_share": round(self.share, 6),
             "reasons": self.reasons,
             "active_faults": self.active_faults,
@@ -94,18 +103,21 @@ def flight_verdict(
     confirmed = any(row.anchor_age_ms is not None and row.anchor_age_ms >= 0 for row in rows)
     unconfirmed_until_s = rows[0].t_s + MAX_UNCONFIRMED_S if confirmed else -math.inf
     distrust = [rejected or _distrust_reason(row, unconfirmed_until_s, faulty_spans) for row in rows]
-    spans = []
+    spans: list[tuple[float, float]] = []
+    files: dict[bool, list[tuple[str, str]]] = {True: [], False: []}
     for trusted, group in groupby(zip(rows, distrust, strict=True), key=lambda pair: not pair[1]):
+        span = [row for row, _ in group]
+        files[trusted].append((span[0].file, span[-1].file))
         if trusted:
-            times_s = [row.t_s for row, _ in group]
-            spans.append((times_s[0], times_s[-1]))
+            spans.append((span[0].t_s, span[-1].t_s))
     reasons = list(dict.fromkeys(reason for reason in distrust if reason))
     if not rows:
         reasons = ["no frame"]
     share = sum(not reason for reason in distrust) / max(len(rows), 1)
     anchored = sum(row.anchor_age_ms == 0 for row in rows)
     cause = likely_cause(len(rows), anchored, (fault for _, fault in ordered), verdict_counts)
-    return FlightVerdict(spans, share, reasons, [_fault_name(fault) for _, fault in active.values()], cause)
+    names = [_fault_name(fault) for _, fault in active.values()]
+    return FlightVerdict(spans, share, reasons, names, cause, tuple(files[True]), tuple(files[False]))
 
 
 def verdict_of(folder: Path) -> FlightVerdict:
@@ -126,6 +138,10 @@ def verdict_of(folder: Path) -> FlightVerdict:
             verdicts[message.measurement][str(message.verdict)] += 1
     found = flight_verdict(list(table.rows.values()), faults, verdicts)
     return replace(found, spans=[(a - (zero_s or 0.0), b - (zero_s or 0.0)) for a, b in found.spans])
+
+
+def _moment(t_s: float, file: str) -> str:
+    return f"{t_s:.1f} s ({file})" if file else f"{t_s:.1f} s"
 
 
 def _distrust_reason(row: Row, unconfirmed_until_s: float, faulty_spans: list[tuple[float, float, str]]) -> str:

@@ -5,11 +5,25 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from msgspec import UnsetType
 
-from terrafix.messages import Camera
+from terrafix.core.geodesy import rot_from_quat
+from terrafix.messages import Camera, NavEstimate
 
 # Lower bound of the denominator of the division model: a point moves outwards by a factor of 4 at most.
 MIN_UNDISTORTION_DENOMINATOR = 0.25
+
+
+# OpenCV's default of five iterations is 1e-3 off at 45 degrees of a lens with k1 = -0.28: a pixel
+# [measured: tests/unit/vision/test_fisheye.py].
+UNDISTORTION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
+
+
+def _undistort_points(points: np.ndarray, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Pixels (N, 1, 2) -> normalised coordinates (N, 1, 2), by cv2.undistortPoints to convergence."""
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
+        return np.asarray(cv2.undistortPointsIter(points, matrix, distortion, None, None, UNDISTORTION))
+    return np.asarray(cv2.undistortPoints(points, matrix, distortion, criteria=UNDISTORTION))
 
 
 def undistort_division(xy: np.ndarray, radial_k1: float) -> np.ndarray:
@@ -46,7 +60,8 @@ class CameraCalibration:
 
     @classmethod
     def of(cls, camera: Camera) -> "CameraCalibration":
-        return cls(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion)
+        distortion = camera.distortion if any(camera.distortion) else ()
+        return cls(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, distortion)
 
     def matrix(self) -> np.ndarray:
         """Camera matrix K (3x3), pixels."""
@@ -56,7 +71,7 @@ class CameraCalibration:
         """Pixels (N, 2) -> undistorted normalised coordinates (N, 2)."""
         if self.distortion:
             points = np.ascontiguousarray(px, dtype=np.float64).reshape(-1, 1, 2)
-            xy = np.asarray(cv2.undistortPoints(points, self.matrix(), np.array(self.distortion))).reshape(-1, 2)
+            xy = _undistort_points(points, self.matrix(), np.array(self.distortion)).reshape(-1, 2)
         else:
             xy = (px - (self.cx, self.cy)) / (self.fx, self.fy)
         return undistort_division(xy, self.radial_k1) if self.radial_k1 else xy
@@ -107,3 +122,10 @@ class Mount:
         rx = np.array([[1.0, 0, 0], [0, math.cos(r), -math.sin(r)], [0, math.sin(r), math.cos(r)]])
         forward_looking = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # camera z = body x, camera x = body y
         return rz @ ry @ rx @ forward_looking
+
+
+def camera_rotation(estimate: NavEstimate, camera: Camera) -> np.ndarray:
+    """R_w_c (3x3) of an estimate: of a camera on a gimbal as estimated, of a fixed one with the mount as described."""
+    if isinstance(estimate.q_w_c, UnsetType):
+        return np.asarray(rot_from_quat(estimate.q_w_b) @ Mount.of(camera).r_b_c())
+    return rot_from_quat(estimate.q_w_c)

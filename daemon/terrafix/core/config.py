@@ -65,6 +65,7 @@ class LinkSection(Section, frozen=True, kw_only=True):
     outputs: list[OutputName] = []  # empty: chosen by autopilot, gps_input for ArduPilot, global_position for PX4
     gnss: GnssMode = "advise"  # reaction when a GNSS receiver disagrees with the map
     gnss_start: bool = True  # initial position from a GNSS receiver, if no other source gives one
+    ground_fix: bool = False  # a fix from the stated start before any map match: the disarmed vehicle stands on ground
     map_offset: bool = True  # subtract the map error that a trusted GNSS receiver shows from the output
     nmea_device: str = ""  # additional output: NMEA 0183 to this device
     nmea_baud: Baud = 115_200

@@ -69,6 +69,7 @@ class MessageLog:
 
     def __init__(self) -> None:
         self._states: dict[tuple[type[Message], Any], Any] = {}
+        self._lost = False
 
     def entry(self, message: Message) -> LogEntry | None:
         """-> the line of the next message; None: it has none."""
@@ -76,7 +77,13 @@ class MessageLog:
         describe = _DESCRIBE.get(kind)
         if describe is None or (kind in _STATE and not self._changes(message)):
             return None
-        return describe(message)
+        entry = describe(message)
+        if isinstance(message, SearchState) and entry is not None:
+            was_lost, self._lost = self._lost, message.step in SEARCHING_STEPS
+            if was_lost != self._lost:
+                name, level = ("RecoveryStarted", "warning") if self._lost else ("RecoverySucceeded", "info")
+                return msgspec.structs.replace(entry, level=level, fields={**entry.fields, "recovery": name})
+        return entry
 
     def _changes(self, message: Message) -> bool:
         """Whether the state differs from that of the message before; the first one changes what is not normal."""
@@ -167,6 +174,8 @@ def _verdict(verdict: MeasurementVerdict) -> LogEntry | None:
     frame = verdict.frame_id if verdict.frame_id >= 0 else None
     if verdict.measurement == "reset":
         return LogEntry("warning", "estimator", "graph begins again", {"frame": frame, "reason": verdict.detail})
+    if verdict.verdict is Verdict.ACCEPTED and verdict.measurement == "user_fix":
+        return LogEntry("info", "estimator", "UserFixApplied", {"frame": frame, "detail": verdict.detail})
     if verdict.verdict is Verdict.ACCEPTED:
         return None
     fields = {"verdict": verdict.verdict.value, "frame": frame, "detail": verdict.detail}

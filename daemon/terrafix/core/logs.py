@@ -1,7 +1,8 @@
 """Structured logs: one JSON object per line on stdout, or an entry of the systemd journal with fields (ON-8).
 
 Logging does not block. ERROR: data or a function is lost, and the line has a field ``todo``; WARN: degraded operation;
-INFO: change of state; DEBUG: for developers. The lines of an event are limited (``RateLimit``)."""
+INFO: change of state; DEBUG: for developers. The lines of an event are limited (``RateLimit``). The record has WARN and
+ERROR whatever the level is."""
 
 import atexit
 import json
@@ -101,19 +102,34 @@ class RateLimit:
         self._clock = clock
         self._times: dict[str, deque[int]] = {}
         self._suppressed: dict[str, int] = {}
+        self._levels: dict[str, str] = {}  # of those, without lines of messages, which are in the record themselves
 
-    def __call__(self, _logger: Any, _method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+    def __call__(self, _logger: Any, method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
         name, now = str(event["event"]), self._clock()
         times = self._times.setdefault(name, deque(maxlen=BURST))
         if len(times) == BURST and now - times[0] < BURST_NS:
             self._suppressed[name] = self._suppressed.get(name, 0) + 1
+            if not event.get(FROM_MESSAGE):
+                self._levels[name] = method
             raise structlog.DropEvent
         times.append(now)
         suppressed = self._suppressed.pop(name, 0)
+        self._levels.pop(name, None)
         return {**event, "suppressed": suppressed} if suppressed else event
+
+    def counts(self, *, last: bool = False) -> Iterator[dict[str, Any]]:
+        """Lines that no further line of their event has counted within BURST_NS, or at the ``last`` call: for the
+        record, as ``take_lines``."""
+        now = self._clock()
+        for name, level in list(self._levels.items()):
+            if last or now - self._times[name][0] >= BURST_NS:
+                del self._levels[name]
+                fields = {"suppressed": self._suppressed.pop(name)}
+                yield {"t_ns": now, "level": level, "event": name, "fields": fields}
 
 
 _lines: deque[dict[str, Any]] = deque(maxlen=KEPT_LINES)
+_limit = RateLimit()
 
 
 def _keep(_logger: Any, _method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
@@ -129,11 +145,12 @@ def _plain(value: Any) -> str | int | float | bool | None:
     return value if value is None or type(value) in (str, int, float, bool) else str(value)
 
 
-def take_lines() -> Iterator[dict[str, Any]]:
-    """The lines that this process has logged since the last call, as the fields of messages.LogLine; those of messages
-    are not among them."""
+def take_lines(*, last: bool = False) -> Iterator[dict[str, Any]]:
+    """The lines that this process has logged since the last call, as the fields of messages.LogLine, and the number of
+    those that the limit has left out; those of messages are not among them. ``last``: there is no further call."""
     while _lines:
         yield _lines.popleft()
+    yield from _limit.counts(last=last)
 
 
 def write(entry: LogEntry | None) -> None:
@@ -144,25 +161,36 @@ def write(entry: LogEntry | None) -> None:
 
 def configure(level: str, process: str, stream: LineStream | None = None) -> LineWriter:
     """Configures structlog for this process and returns the writer, which is closed at exit."""
-    writer = LineWriter(stream or sys.stdout)
+    global _limit
+    writer, _limit = LineWriter(stream or sys.stdout), RateLimit()
     structlog.configure(
         processors=[
-            RateLimit(),
+            _limit,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True, key="time"),  # for readers; t_ns is the reference
             _monotonic,
             structlog.processors.EventRenamer("event"),
             _keep,
+            _from_level(level),
             structlog.processors.dict_tracebacks,
             _with_process(process),
             structlog.processors.JSONRenderer(),
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(LEVELS[level]),
+        wrapper_class=structlog.make_filtering_bound_logger(min(LEVELS[level], logging.WARNING)),
         logger_factory=lambda *_: _Logger(writer),
         cache_logger_on_first_use=False,
     )
     atexit.register(writer.close)
     return writer
+
+
+def _from_level(level: str) -> structlog.typing.Processor:
+    def drop(_logger: Any, method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+        if logging.getLevelNamesMapping()[method.upper()] < LEVELS[level]:
+            raise structlog.DropEvent
+        return event
+
+    return drop
 
 
 def _with_process(process: str) -> structlog.typing.Processor:

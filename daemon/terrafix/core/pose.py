@@ -151,6 +151,12 @@ def _median(values: np.ndarray) -> float:
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
+def positive_part(symmetric: np.ndarray) -> np.ndarray:
+    """``symmetric`` (n, n) with its negative eigenvalues set to zero: a difference of covariances as a covariance."""
+    values, axes = np.linalg.eigh(symmetric)
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)
+
+
 def tangent_to_world(cov: np.ndarray, r_w_c: np.ndarray) -> np.ndarray:
     """Covariance (6x6) in tangent order, camera frame -> (position ENU, rotation about ENU axes), as in messages."""
     a = np.zeros((6, 6))

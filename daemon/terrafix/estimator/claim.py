@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.map_error import illumination_variance_m2
-from terrafix.core.pose import tangent_to_world
+from terrafix.core.pose import positive_part, tangent_to_world
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
 from terrafix.estimator.state import HORIZONTAL, UP, WORLD_POSITION, WORLD_TILT
@@ -15,17 +15,27 @@ from terrafix.estimator.state import HORIZONTAL, UP, WORLD_POSITION, WORLD_TILT
 class Claim:
     """``position_m`` (2,): published, east and north. ``cov`` (6, 6): position, then orientation, world axes.
     ``amsl_m``: published height. ``terms_m2``: mean horizontal variance that each term adds, by its name; their sum is
-    that of ``cov``."""
+    that of ``cov``. What stands against the position beside the graph (integrity/doubts.py): ``own_m2`` (2, 2) of this
+    frame alone, ``doubt_m2`` (2, 2) of the whole position."""
 
     position_m: np.ndarray
     cov: np.ndarray
     amsl_m: float
     terms_m2: dict[str, float]
+    own_m2: np.ndarray
+    doubt_m2: np.ndarray
 
 
-def claim(estimator: Estimator, frame: FrameState, time_offset_sigma_s: float, calibration_sigma_m: float) -> Claim:
+def claim(
+    estimator: Estimator,
+    frame: FrameState,
+    time_offset_sigma_s: float,
+    calibration_sigma_m: float,
+    path_error_m: float = 0.0,
+) -> Claim:
     """Claim of ``frame``, the newest one. ``time_offset_sigma_s``: 1-sigma of the camera against telemetry;
-    ``calibration_sigma_m``: 1-sigma of the position by a description that monitors have found wrong."""
+    ``calibration_sigma_m``: 1-sigma of the position by a description that monitors have found wrong; ``path_error_m``:
+    its error by one that none has named."""
     state = estimator.state
     budget = _Budget(state.covariances.widening**2 * tangent_to_world(frame.cov, frame.pose.rotation().matrix()))
     cov = budget.cov
@@ -38,17 +48,22 @@ def claim(estimator: Estimator, frame: FrameState, time_offset_sigma_s: float, c
     cov[HORIZONTAL, HORIZONTAL] += shift_cov
     budget.close("principal_point")
     cov[WORLD_TILT, WORLD_TILT] += state.camera.body_sigma_rad**2 * np.eye(2)
-    v = frame.velocity_mps
-    cov[WORLD_POSITION, WORLD_POSITION] += time_offset_sigma_s**2 * np.outer(v, v)
+    moved_m2 = time_offset_sigma_s**2 * np.outer(frame.velocity_mps, frame.velocity_mps)
+    cov[WORLD_POSITION, WORLD_POSITION] += moved_m2
     budget.close("time_offset")
-    other_m, budget.cov = estimator.hypotheses.claim(cov)
+    graph_m2, alternative_m2 = cov[HORIZONTAL, HORIZONTAL].copy(), estimator.hypotheses.other.moments_m2()
+    other_m, budget.cov = estimator.hypotheses.claim(cov, path_error_m)
     cov = budget.cov
     budget.close("hypotheses")
     cov[HORIZONTAL, HORIZONTAL] += calibration_sigma_m**2 * np.eye(2)
     budget.close("calibration")
+    own_m2 = moved_m2[HORIZONTAL, HORIZONTAL] + alternative_m2
+    doubt_m2 = positive_part(cov[HORIZONTAL, HORIZONTAL] - graph_m2 - alternative_m2 + np.outer(other_m, other_m))
     amsl_m, amsl_sigma_m = state.amsl(frame)
     cov[UP, UP] += amsl_sigma_m**2
-    return Claim(frame.pose.translation()[HORIZONTAL] + shift_m + other_m, cov, amsl_m, budget.terms_m2)
+    return Claim(
+        frame.pose.translation()[HORIZONTAL] + shift_m + other_m, cov, amsl_m, budget.terms_m2, own_m2, doubt_m2
+    )
 
 
 class _Budget:

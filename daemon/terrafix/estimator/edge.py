@@ -71,6 +71,7 @@ class PoseLog:
             "thermal throttle entered" if entered else "thermal throttle left",
             covariance_mode=self._mode,
             temperature_c=health.temperature_c,
+            clock_mhz=health.clock_mhz,
             cause=health.cause,
         )
 

@@ -3,10 +3,14 @@
 Composed of `FilterState` (graph and window), `Propagation` (frames) and `MapUpdate` (map matches), as OpenVINS is of
 `State`, `Propagator` and its updaters."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState, ImuQuery
+from terrafix.core.geodesy import rot_from_quat
+from terrafix.estimator.filter_state import ORIENTATION_SIZE, FilterState, FrameInput, FrameState, ImuQuery
 from terrafix.estimator.graph.pose_graph import PoseGraph
+from terrafix.estimator.integrity.doubts import Doubts
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
 from terrafix.estimator.map_update import MapResult, MapUpdate
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
@@ -15,7 +19,19 @@ from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.prior import NavPrior
 from terrafix.estimator.propagation import Propagation, PropagationResult
 from terrafix.estimator.relocalization_update import RelocalizationResult, RelocalizationUpdate
+from terrafix.estimator.state import POSE_SIZE
 from terrafix.messages import MapMatch, Origin, Relocalization
+
+
+@dataclass(frozen=True)
+class PastPose:
+    """A refined camera: position ``p_m`` (3,), ``r_w_c`` (3, 3), covariance ``cov`` (6, 6) of position, then rotation,
+    world axes, without the error of the map, and the fragment of the frame."""
+
+    p_m: np.ndarray
+    r_w_c: np.ndarray
+    cov: np.ndarray
+    fragment_id: int
 
 
 class Estimator:
@@ -28,14 +44,11 @@ class Estimator:
         self._propagation = Propagation(self.state, prior)
         self._map_update = MapUpdate(self.state)
         self._relocalization_update = RelocalizationUpdate(self.state)
-        self._ambiguous: dict[int, np.ndarray] = {}  # frame -> covariance (2, 2) of two positions that it may have had
+        self.doubts = Doubts()
 
     def feed_frame(self, frame: FrameInput) -> PropagationResult:
         """A new node. -> the predicted camera and the verdicts on what was measured."""
-        result = self._propagation.advance(frame)
-        if self.hypotheses.other.probability > 0.0:  # for the refinement, which cannot tell right from wrong either
-            self._ambiguous[frame.frame_id] = self.hypotheses.other.inflation_m2()
-        return result
+        return self._propagation.advance(frame)
 
     def feed_map_match(self, match: MapMatch) -> MapResult:
         """Gated, and fused at the node of its frame."""
@@ -85,20 +98,26 @@ class Estimator:
         """1-sigma error of the map of the newest accepted match; 0: there was none."""
         return self._map_update.map_sigma_m
 
-    def refine(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-        """After landing: frame -> position (3,) and covariance (3, 3), by all that was measured in the flight; only of
-        frames that a place stands behind."""
-        result, state = {}, self.state
+    def refine(self) -> dict[int, PastPose]:
+        """After landing: frame -> camera, whose position is by all that was measured in the flight; only of frames that
+        a place stands behind."""
+        result, state, doubts_m2 = dict[int, PastPose](), self.state, self.doubts.of_frames()
+        state.keep_orientations(state.graph.window)
+        orientations = np.array(state.orientations, float).reshape(-1, ORIENTATION_SIZE)
         jacobians = np.array(state.principal_point_jacobians).reshape(-1, 2, 2)
         frames = zip(state.frames, jacobians, *state.graph.refine(), strict=True)
         for node, (frame, jacobian, p_m, cov) in enumerate(frames):
             if state.first_placed_node is None or node < state.first_placed_node:
                 continue
             if np.isfinite(p_m).all() and np.isfinite(cov).all():
-                if frame in self._ambiguous:
-                    cov[:2, :2] += self._ambiguous[frame]
+                if frame in doubts_m2:
+                    cov[:2, :2] += doubts_m2[frame]
                 shift_m, shift_cov = state.principal_point.shift(jacobian)
                 p_m[:2] += shift_m
                 cov[:2, :2] += shift_cov
-                result[frame] = (p_m, cov)
+                full = np.zeros((POSE_SIZE, POSE_SIZE))
+                full[:3, :3], full[3:, 3:] = cov, orientations[node, 4:].reshape(3, 3)
+                w, x, y, z = orientations[node, :4].tolist()
+                r_w_c = rot_from_quat((w, x, y, z))
+                result[frame] = PastPose(p_m, r_w_c, full, state.fragment_ids[node])
         return result

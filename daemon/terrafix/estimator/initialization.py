@@ -17,10 +17,9 @@ from terrafix.estimator.keyframe_substitution import KeyframeSubstitution
 from terrafix.estimator.measurements.attitude_height import (
     DEFAULT_AGL_M,
     DEFAULT_AGL_SIGMA_M,
-    UNKNOWN_ATTITUDE_RAD,
     UNKNOWN_RAD,
 )
-from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.measurements.telemetry_buffer import UNKNOWN_ATTITUDE_RAD, Attitude
 from terrafix.estimator.models.bias_walk import walk_sigmas
 from terrafix.estimator.models.lens_prior import radial_k1_sigma
 from terrafix.estimator.models.motion_model import (
@@ -245,7 +244,7 @@ class Initializer:
         self._prior = prior = self._prior or NavPrior.start(self._origin, t_s)
         if prior.ground is not None:
             terrain.update(prior.ground.plane, np.array(prior.ground.at_m))
-        way_m, way_sigma_m = prior.path_until(t_s, attitude.yaw_rad)
+        way_m, way_sigma_m = prior.path_until(t_s, attitude.vehicle_yaw_rad)
         sigma_m = float(np.hypot(prior.sigma_m, way_sigma_m))
         rise_m = terrain.rise_sigma_m(float(np.hypot(*way_m)) + way_sigma_m)
         calibration = _calibration_at(prior, t_s, attitude, rise_m)
@@ -256,9 +255,10 @@ def _calibration_at(prior: NavPrior, t_s: float, attitude: Attitude, rise_sigma_
     """The calibration of a checkpoint, with its random walk since. None: there is none, or heading or height, which it
     refers to, are not reported now."""
     learnt = prior.learnt
-    if learnt is None or prior.yaw_rad is None or attitude.yaw_rad is None or attitude.agl_m is None:
+    yaw_rad = attitude.vehicle_yaw_rad
+    if learnt is None or prior.yaw_rad is None or yaw_rad is None or attitude.agl_m is None:
         return None
-    turned_rad = math.remainder(attitude.yaw_rad - prior.yaw_rad, math.tau)
+    turned_rad = math.remainder(yaw_rad - prior.yaw_rad, math.tau)
     sigmas = walk_sigmas(max(t_s - learnt.t_s, 0.0), turned_rad, rise_sigma_m)
     return learnt.error, learnt.cov + np.diag(sigmas**2)
 

@@ -174,7 +174,7 @@ class MapUpdate:
             return self._reject(match, node, measurement, fusion.innovation)
         self._rejected.clear()
         if not match.position_only:
-            self.hypotheses.map_consistency.add_accepted(share, position)
+            self.hypotheses.other_ground.on_pose(share, position)
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
         state.covariances.record(node)
@@ -190,7 +190,7 @@ class MapUpdate:
             state.terrain.roughness.update(here, height_m, level_m, float(np.sqrt(cov[UP, UP])))
         if self._fixes.newest_s is not None:
             new_m = self._fixes.new_ground_m(state.graph.time_of(node), here, math.inf)
-            self.hypotheses.other.decay(new_m / height_m, _place_mass(match))
+            self.hypotheses.other.on_pose(new_m / height_m, _place_mass(match))
         self._map_hit_rate.update(state.fragments.of(node), found=True)
 
     def _accept(self, match: MapMatch, t_s: float, here_m: np.ndarray) -> None:
@@ -223,12 +223,12 @@ class MapUpdate:
             run.add(jump[1], here_m, position_only=coarse, t_s=jump[0], cov_m2=claim_m2)
         agrees = run.add(offset, here_m, position_only=coarse, t_s=t_s, cov_m2=claim_m2)
         if not match.position_only and not agrees:  # those that agree with each other support another position
-            self.hypotheses.map_consistency.add_rejected(offset)
+            self.hypotheses.other_ground.on_rejected(offset)
         height = float(measurement.pose.translation()[UP]) - state.terrain.ground_m
         # A pose uses patches of its own frame only. A coarse match depends on earlier frames: one wrong correlation
         # affects all later ones. While no other position is supported, coarse matches count against the graph when they
         # would find a position without it; later they support that position.
-        certain = other.probability == 0.0
+        certain = other.weight == 0.0
         found = run.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height)
         if found or (run.poses if certain else len(run.offsets_m)) >= MIN_CONSISTENT:
             other.spawn(run.offsets_m, apart, fixed=state.last_fix_s is not None)

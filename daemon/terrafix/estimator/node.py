@@ -21,8 +21,9 @@ from terrafix.estimator.integrity.innovation import FusionVerdict
 from terrafix.estimator.integrity.time_offset import TimeOffset
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
-from terrafix.estimator.measurements.odometry import NO_NEW_VIEW
+from terrafix.estimator.measurements.odometry import NO_NEW_VIEW, without_ground
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
+from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
 from terrafix.estimator.output import (
     calibration_of,
@@ -48,6 +49,7 @@ from terrafix.messages import (
     CovarianceMode,
     EkfDeadReckoning,
     Frame,
+    GimbalAttitude,
     Health,
     Imu,
     InitialPosition,
@@ -56,6 +58,7 @@ from terrafix.messages import (
     NavEstimate,
     Odometry,
     Origin,
+    PositionHint,
     Prediction,
     Relocalization,
     ServedVehicle,
@@ -123,9 +126,11 @@ class EstimatorNode:
             InitialPosition: self._on_initial_position,
             VehicleState: self._on_vehicle_state,
             Imu: self._on_imu,
+            GimbalAttitude: self._on_gimbal,
             ServedVehicle: self._on_served_vehicle,
             CandidateAttitude: self._on_candidate_attitude,
             EkfDeadReckoning: self._on_dead_reckoning,
+            PositionHint: self._on_position_hint,
             Health: self._on_health,
             Frame: self._on_frame,
             Odometry: self._on_odometry,
@@ -168,6 +173,7 @@ class EstimatorNode:
             return
         self._origin, self._monitors = origin, Monitors(origin)
         self._axes = LocalFrame(origin.lat_deg, origin.lon_deg)
+        self._telemetry.gimbal.describe(origin.camera)
         self._predicted_id = None  # in other axes
         prior = self._prior(origin, self._axes)
         offset = TimeOffset(Mount.of(origin.camera).r_b_c())
@@ -202,6 +208,7 @@ class EstimatorNode:
         """``time_offset``: of the camera, so far."""
         assert self._axes is not None and self._monitors is not None
         self._estimator = estimator
+        estimator.hypotheses.use(self._monitors.agreement)
         self._flight = EstimatedFlight(estimator, self._axes, time_offset, self._monitors, self._telemetry)
         return estimator
 
@@ -232,6 +239,10 @@ class EstimatorNode:
         self._telemetry.add_imu(imu)
         return ()
 
+    def _on_gimbal(self, attitude: GimbalAttitude) -> Iterable[Message]:
+        self._telemetry.gimbal.add(attitude)
+        return ()
+
     def _on_health(self, health: Health) -> Iterable[Message]:
         self._thermal = health
         return ()
@@ -250,6 +261,22 @@ class EstimatorNode:
         )
         if placed and estimator.last is not None:
             yield self._estimate(estimator, estimator.last, self._claim(estimator.last), sample.t_ns)
+
+    def _on_position_hint(self, hint: PositionHint) -> Iterable[Message]:
+        """A user fix is a measurement of the position; a coarse hint is one of the search alone."""
+        estimator, axes = self._estimator, self._axes
+        if hint.sigma_m is None or estimator is None or axes is None:
+            return
+        if not self._relocated:
+            self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
+        fix = UserFixMeasurement(np.array(axes.to_local(hint.lat_deg, hint.lon_deg)), hint.sigma_m)
+        fusion = apply_user_fix(estimator.state, hint.frame_id, fix)
+        fragment = estimator.state.fragment_of(hint.frame_id)
+        for verdict in (fusion, *self._rebuild_verdicts(estimator)):
+            yield verdict_of(hint.t_ns, hint.frame_id, verdict, fragment)
+        if fusion.verdict is Verdict.ACCEPTED and estimator.last is not None:
+            self._relocated = True
+            yield self._estimate(estimator, estimator.last, self._claim(estimator.last), hint.t_ns)
 
     # --- frames --------------------------------------------------------------------------------------------------
 
@@ -290,6 +317,7 @@ class EstimatorNode:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
         estimator, frame = self._frame_input(self._estimator, odometry)
+        odometry = frame.odometry
         follows = not self._relocated and self._note_predicted_frame(estimator)
         self._relocated = False
         result = estimator.feed_frame(frame)
@@ -311,7 +339,9 @@ class EstimatorNode:
             orientation = estimator.state.orientation.fault
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
-            if estimator.state.orientation.suspects:  # turned or mirrored images move otherwise at any time
+            # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground anyhow.
+            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground
+            if estimator.state.orientation.suspects or untimed:
                 time_offset.forget_images()
             else:
                 time_offset.add(stamped, self._telemetry, agl_m)
@@ -353,6 +383,9 @@ class EstimatorNode:
             estimator = self._apply_initial_position(odometry.frame_id, odometry.t_ns, stands=attitude.stands)
         estimator.state.covariances.set_mode(self.mode)
         imu = self._ahrs.world_acceleration
+        if not attitude.sees_ground:
+            odometry = without_ground(odometry)
+        estimator.state.on_gimbal = self._telemetry.gimbal.used
         return estimator, FrameInput(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, imu)
 
     def _note_predicted_frame(self, estimator: Estimator) -> bool:
@@ -401,8 +434,12 @@ class EstimatorNode:
         return True
 
     def _claim(self, frame: FrameState) -> Claim:
+        """Of ``frame``, the newest one."""
         assert self._flight is not None
-        return self._flight.claim(frame)
+        claim, estimator = self._flight.claim(frame), self._flight.estimator
+        first_node, fix_s = estimator.state.first_node, estimator.last_fix_s
+        estimator.doubts.record(frame, first_node, fix_s, claim.own_m2, claim.doubt_m2)
+        return claim
 
     def _estimate(self, estimator: Estimator, frame: FrameState, budget: Claim, t_ns: int) -> NavEstimate:
         assert self._axes is not None

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
 from terrafix.core.map_error import shared_variance_m2
@@ -111,6 +112,7 @@ def estimate_of(
         velocity_enu_mps=(float(v[0]), float(v[1]), scale * float(v[UP])),
         velocity_sigma_mps=float(np.sqrt(np.linalg.eigvalsh(frame.velocity_cov)[-1])),  # of the worst direction
         q_w_b=quat_from_rot(state.body(frame)),
+        q_w_c=quat_from_rot(frame.pose.rotation().matrix()) if state.on_gimbal else UNSET,
         cov=tuple(float(c) for c in claim.cov.ravel()),
         map_sigma_m=estimator.map_sigma_m,
         source_label=_source(age_ms, tracked=tracked and connected) if state.is_placed else SourceLabel.NOT_PLACED,
@@ -143,18 +145,23 @@ def calibration_of(estimator: Estimator, frame: FrameState) -> CalibrationEstima
 
 
 def refinement_of(estimator: Estimator, axes: LocalFrame, ended: SourceEnded) -> Iterable[Refinement]:
-    """Positions of past frames by all that was measured in the flight."""
-    poses, map_var = [], shared_variance_m2(estimator.map_sigma_m)
-    for frame_id, (p, cov) in sorted(estimator.refine().items()):
-        lat_deg, lon_deg = axes.to_wgs84(float(p[0]), float(p[1]))
+    """Past frames by all that was measured in the flight."""
+    poses, map_cov = [], np.diag([shared_variance_m2(estimator.map_sigma_m)] * 2 + [0.0] * 4)
+    for frame_id, past in sorted(estimator.refine().items()):
+        lat_deg, lon_deg = axes.to_wgs84(float(past.p_m[0]), float(past.p_m[1]))
+        cov = past.cov + map_cov
         poses.append(
             RefinedPose(
                 frame_id=frame_id,
                 lat_deg=lat_deg,
                 lon_deg=lon_deg,
-                alt_amsl_m=float(p[UP]) if estimator.state.amsl_known else None,
-                sigma_e_m=float(np.sqrt(cov[0, 0] + map_var)),
-                sigma_n_m=float(np.sqrt(cov[1, 1] + map_var)),
+                alt_amsl_m=float(past.p_m[UP]) if estimator.state.amsl_known else None,
+                sigma_e_m=float(np.sqrt(cov[0, 0])),
+                sigma_n_m=float(np.sqrt(cov[1, 1])),
+                cov_en_m2=float(cov[0, 1]),
+                fragment_id=past.fragment_id,
+                q_w_c=quat_from_rot(past.r_w_c),
+                cov=tuple(cov.ravel().tolist()),
             )
         )
     yield Refinement(t_ns=ended.t_ns, poses=poses)

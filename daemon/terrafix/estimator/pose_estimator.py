@@ -57,7 +57,8 @@ class EstimatedFlight:
     telemetry: Telemetry
 
     def claim(self, frame: FrameState) -> Claim:
-        return claim(self.estimator, frame, self.time_offset.sigma_s, self.monitors.sigma_m)
+        monitors = self.monitors
+        return claim(self.estimator, frame, self.time_offset.sigma_s, monitors.sigma_m, monitors.path_error_m)
 
     def fuse(self, match: MatchResult, mode: CovarianceMode) -> MatchOutcome:
         """Solves ``match``, gates its pose and adds it to the graph. A rejected match is a verdict in the result."""

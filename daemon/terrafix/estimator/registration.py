@@ -10,8 +10,8 @@ import numpy as np
 
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState, FrameInput
-from terrafix.estimator.measurements.attitude_height import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.odometry import GatedOdometry, KeyframeMotion
+from terrafix.estimator.measurements.telemetry_buffer import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.models.motion_model import STATIONARY_M, MotionIncrement, fuse_odometry_increment
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.state import DELTA_P, TRANSLATION, NodeState

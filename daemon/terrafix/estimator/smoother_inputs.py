@@ -31,7 +31,7 @@ def odometry_link(estimator: Estimator, result: PropagationResult, t_ns: int) ->
         parent_id=state.frames[motion.parent],
         fragment_id=fragment.fragment_id,
         agl_m=state.terrain.height_above_m(result.placed.pose.translation()),
-        ambiguity_m2=_flat2(ambiguous.inflation_m2()) if ambiguous.probability > 0.0 else (0.0, 0.0, 0.0, 0.0),
+        ambiguity_m2=_flat2(ambiguous.moments_m2()) if ambiguous.weight > 0.0 else (0.0, 0.0, 0.0, 0.0),
         **_relative(_between(state, motion, result), motion.motion),
     )
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from terrafix.core.config import HealthSection
 from terrafix.core.errors import ConfigError
 from terrafix.core.node import Edge, NodeContext
-from terrafix.health.power import clock_limit, whole_computer_w
+from terrafix.health.power import most_limited, whole_computer_w
 from terrafix.health.sysfs import HealthEdge
 from terrafix.health.zones import DecidingZones
 from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, ThermalReading
@@ -50,6 +50,7 @@ class HealthNode:
             band = ThermalBand.HOT
         if reading.throttling:
             cause += f"; throttled by {', '.join(reading.throttling)}"
+        limited = most_limited(reading.clocks)
         return Health(
             t_ns=reading.t_ns,
             band=band,
@@ -58,7 +59,8 @@ class HealthNode:
             disk_free_mb=reading.disk_free_mb,
             cause=cause,
             power_w=whole_computer_w(reading.rails),
-            clock_limit=clock_limit(reading.clocks),
+            clock_limit=None if limited is None else limited.limit_mhz / limited.max_mhz,
+            clock_mhz=None if limited is None else limited.limit_mhz,
         )
 
     def _band(self, hottest: TemperatureZone | None) -> tuple[ThermalBand, str]:

@@ -33,9 +33,9 @@ def read_clocks(sysfs: Path) -> list[ProcessorClock]:
     return [clock for clock in clocks if clock is not None]
 
 
-def clock_limit(clocks: list[ProcessorClock]) -> float | None:
-    """-> the lowest share of its highest clock that a processor may run at (0..1); None without clocks."""
-    return min((clock.limit_mhz / clock.max_mhz for clock in clocks), default=None)
+def most_limited(clocks: list[ProcessorClock]) -> ProcessorClock | None:
+    """-> the processor that may run at the lowest share of its highest clock; None without clocks."""
+    return min(clocks, key=lambda clock: clock.limit_mhz / clock.max_mhz, default=None)
 
 
 def read_rails(hwmon: Path) -> list[PowerRail]:

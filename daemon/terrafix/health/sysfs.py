@@ -60,6 +60,7 @@ class HealthEdge:
                 before=before,
                 cause=message.cause,
                 clock_limit=message.clock_limit,
+                clock_mhz=message.clock_mhz,
                 power_w=message.power_w,
             )
 

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.core import clock
 from terrafix.core.clock import NS_PER_S
 from terrafix.core.config import LinkSection
+from terrafix.core.mavlink.gimbal import GIMBAL_COMPONENTS
 from terrafix.link.admission.packet_filter import Admission
 from terrafix.link.admission.served_autopilot import AUTOPILOT_COMPONENT, Role
 from terrafix.link.autopilot.autopilot_prior import AutopilotPrior
@@ -257,6 +258,16 @@ class MavlinkEdge:
                 self._connection.send(hint_or_reply, to=sender)
         if role is Role.AUTOPILOT:
             yield from self._on_autopilot_packet(message, now_ns)
+        elif message.get_srcSystem() == self._served.sysid and sender == self._served.address:
+            yield from self._on_gimbal_packet(message, now_ns)
+
+    def _on_gimbal_packet(self, message: Any, now_ns: int) -> Iterator[Message]:
+        """Processes one packet of another component of the served vehicle, behind its autopilot."""
+        if message.get_srcComponent() not in GIMBAL_COMPONENTS or self._served.is_contested(now_ns):
+            return
+        self._streams.on_message(message.get_msgId())
+        if (gimbal := self._autopilot.telemetry.on_gimbal(message, now_ns)) is not None:
+            yield gimbal
 
     def _on_autopilot_packet(self, message: Any, now_ns: int) -> Iterator[Message]:
         """Processes one packet of the served autopilot."""

@@ -59,7 +59,13 @@ def make_node(ctx: NodeContext) -> "LinkNode":
     clock = LatchedClock(None if checkpoint is None else checkpoint.unix_minus_monotonic_ns)
     on_vision = PreviousSourceFile(ctx.state_dir).load() is not None
     return LinkNode(
-        link.rate_hz, link.gnss, gnss_start=link.gnss_start, map_offsets=offsets, clock=clock, on_vision=on_vision
+        link.rate_hz,
+        link.gnss,
+        gnss_start=link.gnss_start,
+        ground_fix=link.ground_fix,
+        map_offsets=offsets,
+        clock=clock,
+        on_vision=on_vision,
     )
 
 
@@ -84,6 +90,7 @@ class LinkNode:
         gnss: GnssMode = "advise",
         *,
         gnss_start: bool = True,
+        ground_fix: bool = False,
         map_offsets: MapOffsetEstimator | None = None,
         clock: LatchedClock | None = None,
         on_vision: bool = False,
@@ -99,7 +106,9 @@ class LinkNode:
         self._ekf_monitor = EkfStatusMonitor()
         self._candidates: list[int] = []  # of ServedVehicle
         self._armed: bool | None = None
-        self._position_confirmed = False  # the vehicle was disarmed once, or there was a map fix
+        self._ground_fix, self._stood = ground_fix, False  # ``_stood``: it was disarmed once
+        # There was a map fix, a receiver has measured that the vehicle stands, or the operator says so.
+        self._position_confirmed = False
         self._now_ns = 0
         self._ground_amsl_m: float | None = None
         self._clock = clock or LatchedClock()
@@ -171,7 +180,8 @@ class LinkNode:
         self._gnss.on_vehicle_state(state)
         self._starts.on_armed(state.armed)
         self._armed = state.armed
-        self._position_confirmed = self._position_confirmed or state.armed is False
+        self._stood = self._stood or state.armed is False
+        self._position_confirmed = self._position_confirmed or (self._ground_fix and self._stood)
         return []
 
     def _on_imu(self, imu: Imu) -> list[Message]:
@@ -188,6 +198,8 @@ class LinkNode:
 
     def _on_initial_position(self, initial: InitialPosition) -> list[Message]:
         text = self._starts.on_answer(initial)
+        stands = initial.verdict is Verdict.ACCEPTED and initial.lat_deg is not None  # five seconds below 0.5 m/s
+        self._position_confirmed = self._position_confirmed or stands
         return [] if text is None else [text]
 
     def _on_wall_clock(self, clock: WallClock) -> list[Message]:
@@ -314,8 +326,8 @@ class LinkNode:
                 self._gate.pending_jump, "the position has jumped"
             )
             self._fix_gate.withdraw()
-        elif self._armed and not self._position_confirmed:
-            no_fix_reason = fix_type.STARTED_IN_FLIGHT
+        elif self._armed is not None and not self._position_confirmed:
+            no_fix_reason = fix_type.ONLY_DISARMED if self._stood else fix_type.STARTED_IN_FLIGHT
             self._fix_gate.withdraw()
         else:
             no_fix_reason = self._fix_gate.evaluate(predicted, horizontal_m, self._level, estimate.source_label)

@@ -181,9 +181,9 @@ class LiveShell:
         now = now_ns()
         self._publish(Dropped(t_ns=now, process=self._process.name, message=k, count=n) for k, n in counts.items())
 
-    def _publish_log_lines(self) -> None:
+    def _publish_log_lines(self, *, last: bool = False) -> None:
         """Publishes what this process has logged beside its messages, so that it is in the record."""
-        for line in logs.take_lines():
+        for line in logs.take_lines(last=last):
             message = LogLine(process=self._process.name, **line)
             if self._edge is not None:
                 self._edge.on_message(message)  # the edge of the recorder writes those of its own process
@@ -223,7 +223,7 @@ class LiveShell:
         until = now_ns() + STOP_DRAIN_NS
         while now_ns() < until and (self._process_next() or self._subscriber.socket.poll(STOP_QUIET_MS)):
             self._progress.stamp(now_ns(), len(self._inbox))
-        self._publish_log_lines()
+        self._publish_log_lines(last=True)
         self._publish_input_order()
 
 

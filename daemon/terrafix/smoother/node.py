@@ -33,7 +33,7 @@ from terrafix.smoother.solution import Placed, followers, predict, solve
 
 PERIOD_NS = 1_000_000_000  # from one Refinement to the next, at least [spec: once a second]
 IDLE_NS = 5_000_000_000  # from one solution to the next, while map matches move nothing [spec: a merge within 5 s]
-MAX_POSES = 400  # of a Refinement; the others follow in the next ones [spec: 50 kB]
+MAX_POSES = 128  # of a Refinement; the others follow in the next ones [spec: 50 kB]
 # Change of a pose, or of its 1-sigma, in 1-sigma, from which it is published again. [spec: changes no decision below]
 MOVED_SIGMAS = 0.25
 HORIZONTAL = slice(0, 2)
@@ -209,7 +209,8 @@ class SmootherNode:
     def _refined(self, frame_id: int, placed: Placed, p_m: np.ndarray, cov: np.ndarray) -> RefinedPose:
         assert self._axes is not None
         lat_deg, lon_deg = self._axes.to_wgs84(float(p_m[0]), float(p_m[1]))
-        rotation_sigma = np.sqrt(np.diag(placed.cov)[3:])
+        full = placed.cov.copy()
+        full[HORIZONTAL, HORIZONTAL] = cov
         return RefinedPose(
             frame_id=frame_id,
             lat_deg=lat_deg,
@@ -220,7 +221,8 @@ class SmootherNode:
             cov_en_m2=float(cov[0, 1]),
             fragment_id=self._graph.frames[frame_id].fragment_id,
             q_w_c=quat_from_rot(placed.pose.rotation().matrix()),
-            rotation_sigma_rad=(float(rotation_sigma[0]), float(rotation_sigma[1]), float(rotation_sigma[2])),
+            cov=tuple(full.ravel().tolist()),
+            m_per_unit=placed.m_per_unit,
         )
 
 

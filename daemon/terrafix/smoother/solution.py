@@ -18,10 +18,12 @@ MAX_SCALE_SIGMA = 0.3  # a height known no better does not give the scale [spec:
 
 @dataclass(frozen=True)
 class Placed:
-    """``pose`` of a camera in the world, and its covariance (6, 6): position, then rotation, world axes."""
+    """``pose`` of a camera in the world, and its covariance (6, 6): position, then rotation, world axes.
+    ``m_per_unit``: scale of its submap."""
 
     pose: gtsam.Pose3
     cov: np.ndarray
+    m_per_unit: float
 
 
 def solve(graph: KeyframeGraph) -> dict[int, Placed]:
@@ -83,7 +85,8 @@ def _poses(group: list[list[int]], merged: MergedSubmaps) -> dict[int, Placed]:
         for i, keyframe in enumerate(piece):
             r_w_c = placement.r_w_c[i]
             pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(r_w_c), placement.p_c_in_w_m[i])
-            poses[keyframe] = Placed(pose, tangent_to_world(placement.cov[i], r_w_c))
+            cov = tangent_to_world(placement.cov[i], r_w_c)
+            poses[keyframe] = Placed(pose, cov, float(placement.m_per_unit[i]))
     return poses
 
 
@@ -128,7 +131,8 @@ def predict(graph: KeyframeGraph, frame_id: int, placed: dict[int, Placed]) -> P
     pose = keyframe.pose.compose(between)
     moved = np.eye(6)
     moved[:3, 3:] = -_skew(pose.translation() - keyframe.pose.translation())
-    return Placed(pose, moved @ keyframe.cov @ moved.T + tangent_to_world(cov, pose.rotation().matrix()))
+    own = tangent_to_world(cov, pose.rotation().matrix())
+    return Placed(pose, moved @ keyframe.cov @ moved.T + own, keyframe.m_per_unit)
 
 
 def followers(graph: KeyframeGraph, keyframe: int, placed: dict[int, Placed]) -> Iterator[tuple[int, Placed]]:
@@ -155,7 +159,7 @@ def _follower(graph: KeyframeGraph, frame_id: int, after_id: int | None, placed:
     moved[:3, 3:] = -_skew(lever)
     begin_cov = moved @ keyframe.cov @ moved.T
     if after_id is None:
-        return Placed(here, begin_cov + own)
+        return Placed(here, begin_cov + own, keyframe.m_per_unit)
     after, end = graph.frames[after_id], placed[after_id]
     share = (node.t_ns - graph.frames[node.parent].t_ns) / max(after.t_ns - graph.frames[node.parent].t_ns, 1)
     share = min(max(share, 0.0), 1.0)
@@ -164,7 +168,7 @@ def _follower(graph: KeyframeGraph, frame_id: int, after_id: int | None, placed:
     turn = share * gtsam.Rot3.Logmap(end.pose.rotation().compose(expected.rotation().inverse()))
     pose = gtsam.Pose3(gtsam.Rot3.Expmap(turn).compose(here.rotation()), here.translation() + shift)
     bridge = share * (1.0 - share) * tangent_to_world(with_scale(after), expected.rotation().matrix())
-    return Placed(pose, (1.0 - share) * keyframe.cov + share * end.cov + bridge)
+    return Placed(pose, (1.0 - share) * keyframe.cov + share * end.cov + bridge, keyframe.m_per_unit)
 
 
 def _skew(v: np.ndarray) -> np.ndarray:

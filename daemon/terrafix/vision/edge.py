@@ -82,7 +82,7 @@ class SourceEdge:
         if shot is not None:
             if shot.image is not None:
                 self._frames.put(shot.frame.frame_id, shot.image)
-            messages += [*shot.imu, *shot.states, shot.frame]
+            messages += [*shot.imu, *shot.states, *shot.others, shot.frame]
         elif ended and not self._end_published:
             self._reading.result()  # re-raises an exception of the reader thread in this process
             self._end_published = True
@@ -135,12 +135,13 @@ class SourceEdge:
         )
         states = tuple(msgspec.structs.replace(state, t_ns=state.t_ns + shift_ns) for state in shot.states)
         imu = tuple(msgspec.structs.replace(reading, t_ns=reading.t_ns + shift_ns) for reading in shot.imu)
-        return Shot(frame, states, shot.image, imu)
+        others = tuple(msgspec.structs.replace(other, t_ns=other.t_ns + shift_ns) for other in shot.others)
+        return Shot(frame, states, shot.image, imu, others)
 
     def _push(self, shot: Shot) -> None:
         if self._rate is not None and not self._rate.takes_frame(shot.frame.t_ns):
             with self._changed:
-                self._dropped.extend((*shot.imu, *shot.states))
+                self._dropped.extend((*shot.imu, *shot.states, *shot.others))
             return
         with self._changed:
             if not self._realtime and not self._source.live:  # lossless: the reader blocks until there is room
@@ -149,7 +150,7 @@ class SourceEdge:
             self._shots.append(shot)
             if len(self._shots) > 1 and (self._realtime or self._source.live):  # the newest first, and it alone
                 old = self._shots.popleft()
-                self._dropped.extend((*old.imu, *old.states))
+                self._dropped.extend((*old.imu, *old.states, *old.others))
                 self._dropped.append(msgspec.structs.replace(old.frame, error=old.frame.error or OVERTAKEN))
 
 

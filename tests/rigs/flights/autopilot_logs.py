@@ -10,16 +10,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from flight_records import gps_input, origin, write_record
 from terrafix import messages as m
+from terrafix.core.autopilot_log.alignment import interpolate
+from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
 from terrafix.core.mavlink.tlog import record as tlog_record
-from terrafix_tools.autopilot_log.alignment import interpolate
-from terrafix_tools.autopilot_log.structure import Attitude, cleaned
 
 OFFSET_S, DRIFT = 3.0, 50e-6  # log less record in the middle of the flight; of the log's clock
 PLACE = (48.0, 11.0, 500.0)  # latitude, longitude [degrees], height [m AMSL] of the origin
 T0_US = 1_717_236_000_000_000  # UNIX time of the zero of a telemetry log
 
 
-def flight(seed: int, duration_s: float = 120.0, rate_hz: float = 25.0, start_s: float = 20.0) -> Attitude:
+def flight(seed: int, duration_s: float = 120.0, rate_hz: float = 25.0, start_s: float = 20.0) -> AttitudeSeries:
     """Attitude on the clock of the log: swinging of 0.03 to 1 Hz, and gusts."""
     rng = np.random.default_rng(seed)
     t_s = start_s + np.arange(0.0, duration_s, 1.0 / rate_hz)
@@ -30,18 +30,18 @@ def flight(seed: int, duration_s: float = 120.0, rate_hz: float = 25.0, start_s:
         swing = np.sin(math.tau * frequency_hz * t_s[:, None] + phase) / (1.0 + (frequency_hz / 0.2) ** 2)
         gusts = np.convolve(rng.normal(0.0, 0.2, t_s.size), np.hanning(round(rate_hz)) / math.sqrt(rate_hz), "same")
         angles.append(amplitude * (swing.sum(axis=1) / math.sqrt(10.0) + gusts))
-    return Attitude(t_s, angles[0], angles[1], np.mod(angles[2] + math.pi, math.tau) - math.pi)
+    return AttitudeSeries(t_s, angles[0], angles[1], np.mod(angles[2] + math.pi, math.tau) - math.pi)
 
 
-def part(attitude: Attitude, from_s: float, to_s: float) -> Attitude:
+def part(attitude: AttitudeSeries, from_s: float, to_s: float) -> AttitudeSeries:
     keep = (attitude.t_s >= from_s) & (attitude.t_s < to_s)
     columns = (attitude.t_s, attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
-    return Attitude(*(column[keep] for column in columns))
+    return AttitudeSeries(*(column[keep] for column in columns))
 
 
 def telemetry(
-    log: Attitude, seed: int, rate_hz: float = 10.0, jitter_s: float = 0.005, gaps: int = 2
-) -> tuple[Attitude, Callable[[np.ndarray], np.ndarray]]:
+    log: AttitudeSeries, seed: int, rate_hz: float = 10.0, jitter_s: float = 0.005, gaps: int = 2
+) -> tuple[AttitudeSeries, Callable[[np.ndarray], np.ndarray]]:
     """-> the attitude as the record has it, and the true time of the log of times of the record.
 
     The record's clock differs by OFFSET_S and DRIFT. Packets arrive late by an exponential time of mean ``jitter_s``; 2
@@ -59,10 +59,10 @@ def telemetry(
     def true_s(record_s: np.ndarray) -> np.ndarray:
         return record_s + OFFSET_S + DRIFT * (record_s - (middle_s - OFFSET_S))
 
-    return cleaned(Attitude(received_s[kept], *angles[kept].T)), true_s
+    return cleaned(AttitudeSeries(received_s[kept], *angles[kept].T)), true_s
 
 
-def write_flight_record(path: Path, attitude: Attitude, sent: list[m.GpsInput] | None = None) -> Path:
+def write_flight_record(path: Path, attitude: AttitudeSeries, sent: list[m.GpsInput] | None = None) -> Path:
     """Writes a record with the attitude as telemetry, and what was sent."""
     states: list[m.Message] = [
         m.VehicleState(
@@ -152,7 +152,7 @@ def write_dataflash_text(path: Path, rows: list[Row], formats: dict[str, tuple[s
     return path
 
 
-def attitude_rows(attitude: Attitude) -> list[Row]:
+def attitude_rows(attitude: AttitudeSeries) -> list[Row]:
     rows: list[Row] = []
     for t_s, *angles in zip(attitude.t_s, attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad, strict=True):
         roll, pitch, yaw = (math.degrees(angle) for angle in angles)
@@ -170,7 +170,9 @@ def write_tlog(path: Path, timed: list[tuple[float, mavlink.MAVLink_message]]) -
     return path
 
 
-def attitude_messages(attitude: Attitude, boot_s: float = 0.0) -> list[tuple[float, mavlink.MAVLink_attitude_message]]:
+def attitude_messages(
+    attitude: AttitudeSeries, boot_s: float = 0.0
+) -> list[tuple[float, mavlink.MAVLink_attitude_message]]:
     """ATTITUDE without latency; ``boot_s``: time of the log at which the autopilot started."""
     return [
         (t_s, mavlink.MAVLink_attitude_message(round((t_s - boot_s) * 1e3), roll, pitch, yaw, 0.1, 0.2, 0.3))
@@ -214,7 +216,7 @@ def write_ulog(path: Path, topics: list[Topic], texts: list[tuple[float, str]] |
     return path
 
 
-def attitude_topic(attitude: Attitude) -> Topic:
+def attitude_topic(attitude: AttitudeSeries) -> Topic:
     rows = []
     for t_s, *angles in zip(attitude.t_s, attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad, strict=True):
         (cr, cp, cy), (sr, sp, sy) = (np.cos(np.array(angles) / 2), np.sin(np.array(angles) / 2))

@@ -125,7 +125,7 @@ class InertialFlight:
 
 
 @dataclass(frozen=True)
-class Flown:
+class InertialErrors:
     """One row per frame: the last published estimate. Errors are estimate minus truth, ENU."""
 
     estimates: list[NavEstimate]
@@ -147,7 +147,7 @@ def flown(
     iced: float = 1.0,
     no_camera: tuple[int, int] = (0, 0),
     frames: int = 1000,
-) -> Flown:
+) -> InertialErrors:
     """Runs an EstimatorNode on the first ``frames`` frames of a flight.
 
     ``imu``, ``airspeed``: the telemetry has them. ``blind``: frames (first, end) without tracked features and map
@@ -166,7 +166,7 @@ def flown(
             run.feed([message])
     rows = run.estimates()
     errors_m = [np.array([*PLACE.to_local(e.lat_deg, e.lon_deg)]) - flight.poses[e.frame_id][1][:2] for e in rows]
-    return Flown(
+    return InertialErrors(
         rows,
         np.array(errors_m),
         np.sqrt(np.array([[e.cov[0], e.cov[7]] for e in rows])),

@@ -32,7 +32,7 @@ def unaltered(shot: Shot) -> Shot | None:
 
 
 @dataclass
-class Flown:
+class MaplessFlight:
     """``truth_m``: frame -> true position (2,), east and north; ``published``: by vision and estimator."""
 
     place: LocalFrame
@@ -68,12 +68,12 @@ class Flown:
 
 def fly(
     folder: Path, alter: Alter = unaltered, *, relocalize: bool = True, estimate: bool = True, imu: bool = True
-) -> Flown:
+) -> MaplessFlight:
     """``relocalize``: the estimator gets Relocalization; ``estimate``: there is an estimator."""
     source = open_source(str(folder))
     origin, store = source.origin(), MemoryFrameStore()
     truth = {row["file"]: (float(row["lat_deg"]), float(row["lon_deg"])) for row in _rows(folder / "truth.csv")}
-    flown = Flown(LocalFrame(origin.lat_deg, origin.lon_deg))
+    flown = MaplessFlight(LocalFrame(origin.lat_deg, origin.lon_deg))
     vision, estimator = VisionNode(store), EstimatorNode()
 
     def deliver(message: Message) -> None:

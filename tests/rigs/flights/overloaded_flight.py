@@ -50,7 +50,7 @@ class LateStamps(InertialFlight):
 
 
 @dataclass
-class Flown:
+class OverloadedResult:
     """``estimates``: with the error of each, (2,) east and north. ``maps``: verdicts on map matches."""
 
     estimates: list[tuple[NavEstimate, np.ndarray]] = field(default_factory=list)
@@ -75,10 +75,10 @@ class Flown:
         return [v for v in self.verdicts if v.measurement == "reset" and v.t_ns * 1e-9 > after_s]
 
 
-def fly(flight: InertialFlight, load: Load, seed: int = 0, end_s: float = math.inf) -> Flown:
+def fly(flight: InertialFlight, load: Load, seed: int = 0, end_s: float = math.inf) -> OverloadedResult:
     """The flight (5 frames a second) through an EstimatorNode. Vision registers each frame that it gets to its
     keyframe, as `FrameTracker` does, whatever then becomes of the message."""
-    run, flown = EstimatorRun(), Flown()
+    run, flown = EstimatorRun(), OverloadedResult()
     for reply in run.feed([ORIGIN, *_messages(flight, load, np.random.default_rng([seed, 54]), end_s)]):
         if isinstance(reply, NavEstimate):
             at_m = np.array(PLACE.to_local(reply.lat_deg, reply.lon_deg))

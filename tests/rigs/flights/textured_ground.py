@@ -1,5 +1,7 @@
 """Textured ground, flat at height zero or sloped, views of it by a camera, and the ground as a map."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
@@ -15,6 +17,11 @@ LENS = CameraCalibration(640, 360, 380.0, 385.0, 310.0, 185.0, (-0.12, 0.03, 0.0
 
 def texture(seed: int = 0, side_m: float = SIDE_M) -> np.ndarray:
     """-> (H, W, 3) uint8, GSD_M per pixel, north up, centre at (0, 0): structures of many sizes without repetition."""
+    return _texture(seed, side_m).copy()
+
+
+@lru_cache(maxsize=6)
+def _texture(seed: int, side_m: float) -> np.ndarray:
     rng = np.random.default_rng(seed)
     side = round(side_m / GSD_M)
     image = np.full((side, side), 110.0, np.float32)

@@ -1,5 +1,6 @@
 """Small generated GeoTIFFs for the tests of map builder and map reader."""
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,11 @@ from rasterio.transform import Affine
 
 def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
     """-> (3, height, width) uint8 RGB: smooth noise of several scales, without the values 0 and 255."""
+    return _texture(height, width, seed).copy()
+
+
+@lru_cache(maxsize=16)  # the wide blur costs more than the map that a test builds of it
+def _texture(height: int, width: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     image = np.zeros((height, width, 3), np.float32)
     for sigma_px, weight in ((2.5, 1.0), (12.0, 1.2), (40.0, 1.0)):

@@ -9,7 +9,7 @@ from rasterio.transform import Affine
 
 from terrafix.core.errors import UsageError
 from terrafix_lab.accept import adversary
-from terrafix_lab.accept.cases_table import Case, Line, lines_of, markdown
+from terrafix_lab.accept.cases_table import Case, CaseLine, lines_of, markdown
 from terrafix_lab.accept.fly import Result
 from terrafix_lab.accept.measuring.criteria import PERMANENT, TEMPORARY, unmeasured
 from terrafix_lab.accept.measuring.results import JudgedRow, Verdict
@@ -114,7 +114,7 @@ def measured(names: tuple[str, ...], **values: float) -> list[JudgedRow]:
 
 
 def test_the_table_pools_flights_and_marks_those_that_never_recovered() -> None:
-    def line(place: str, **values: float) -> list[Line]:
+    def line(place: str, **values: float) -> list[CaseLine]:
         rows = measured(TEMPORARY, near_at_all=0.5, **values)
         results = [Result(scenario="s", promise="", rows=rows, frames=100)]
         case = Case(place, AcceptOptions(out=Path("out")))

@@ -19,7 +19,7 @@ from terrafix.messages import Camera, Frame, Imu, Origin, VehicleState
 from terrafix.vision.sources import Shot
 from terrafix_lab.accept.false_inputs import maps as lying_maps
 from terrafix_lab.accept.false_inputs.scenarios import LIES
-from terrafix_lab.accept.flight import Flight, FrameRef
+from terrafix_lab.accept.flight import AcceptFlight, FrameRef
 from terrafix_lab.accept.plan import CLOSED_LOOP, Plan
 from terrafix_lab.accept.scenarios import BY_NAME, SCENARIOS
 from terrafix_lab.faults import edits, pictures
@@ -35,12 +35,12 @@ NS = 10**9
 FRAMES, STEP_S, STEP_M = 100, 0.5, 12.0
 
 
-def flight(frames: int = FRAMES, map_path: Path | None = Path("map.tif")) -> Flight:
+def flight(frames: int = FRAMES, map_path: Path | None = Path("map.tif")) -> AcceptFlight:
     """Straight north at 24 m/s."""
     place = LocalFrame(48.0, 11.0)
     truth = {f"{i}.jpg": Truth(*place.to_wgs84(0.0, i * STEP_M)) for i in range(frames)}
     frame_refs = [FrameRef(f"{i}.jpg", i * STEP_S, None) for i in range(frames)]
-    return Flight("flight", map_path, None, truth, frame_refs, footprint_m=100.0)
+    return AcceptFlight("flight", map_path, None, truth, frame_refs, footprint_m=100.0)
 
 
 def shots(frames: int = FRAMES) -> Iterator[Shot]:
@@ -63,7 +63,7 @@ def greys(found: list[Shot]) -> list[int]:
     return [round(float(np.mean(s.image[:, :4]))) for s in found if s.image is not None]
 
 
-def planned(name: str, of: Flight | None = None) -> Plan:
+def planned(name: str, of: AcceptFlight | None = None) -> Plan:
     plan = BY_NAME[name].plan(of or flight())
     assert isinstance(plan, Plan), plan
     return plan
@@ -76,7 +76,7 @@ def lie_of(plan: Plan) -> Span:
 
 @pytest.fixture
 def numbered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Flight, "picture", lambda _, number: list(shots(number + 1))[-1].image)
+    monkeypatch.setattr(AcceptFlight, "picture", lambda _, number: list(shots(number + 1))[-1].image)
 
 
 @pytest.mark.usefixtures("numbered")

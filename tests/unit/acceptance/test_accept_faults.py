@@ -16,7 +16,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, Frame, Health, MapMatch, Message, Origin, Prediction, VehicleState, Verdict
 from terrafix.vision.sources import Shot
 from terrafix_lab.accept.false_inputs.maps import stale_along
-from terrafix_lab.accept.flight import Flight, FrameRef, read_any_truth
+from terrafix_lab.accept.flight import AcceptFlight, FrameRef, read_any_truth
 from terrafix_lab.accept.long_route import ThereAndBack, original
 from terrafix_lab.accept.plan import Plan
 from terrafix_lab.accept.scenarios import BY_NAME
@@ -161,14 +161,14 @@ def test_throttling_is_reported_within_its_span() -> None:
     assert [m.throttled for m in inner.received if isinstance(m, Health)] == [False, True, True, False]
 
 
-def straight(frames: int = 40, step_m: float = 20.0, map_path: Path | None = None) -> Flight:
+def straight(frames: int = 40, step_m: float = 20.0, map_path: Path | None = None) -> AcceptFlight:
     """North, then sharply east after half of the frames."""
     place = LocalFrame(48.0, 11.0)
     half = frames // 2
     at = [(0.0, i * step_m) if i <= half else ((i - half) * step_m, half * step_m) for i in range(frames)]
     truth = {f"{i}.jpg": Truth(*place.to_wgs84(*p)) for i, p in enumerate(at)}
     frame_refs = [FrameRef(f"{i}.jpg", i * 0.5, None) for i in range(frames)]
-    return Flight("flight", map_path, None, truth, frame_refs, footprint_m=100.0)
+    return AcceptFlight("flight", map_path, None, truth, frame_refs, footprint_m=100.0)
 
 
 def test_the_gap_is_at_the_turn_of_the_track_and_leaves_no_overlap() -> None:
@@ -185,7 +185,7 @@ def test_the_gap_is_at_the_turn_of_the_track_and_leaves_no_overlap() -> None:
 
 def test_a_far_frame_is_inserted_350_m_from_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = straight()
-    monkeypatch.setattr(Flight, "picture", lambda _, number: np.full((4, 8, 3), number, np.uint8))
+    monkeypatch.setattr(AcceptFlight, "picture", lambda _, number: np.full((4, 8, 3), number, np.uint8))
     plan = BY_NAME["350 m frame"].plan(flight)
     assert isinstance(plan, Plan) and len(plan.marks.wrong_files) == 3
     track = flight.track_m()
@@ -215,7 +215,7 @@ def test_the_unmatchable_fifth_is_not_visible_in_other_frames() -> None:
     truth = {f"{i}.jpg": Truth(*place.to_wgs84(*p)) for i, p in enumerate(at)}
     frame_refs = [FrameRef(f"{i}.jpg", i * 0.5, None) for i in range(frames)]
     plan = BY_NAME["20 % unmatchable"].plan(
-        Flight("flight", Path("map.tif"), None, truth, frame_refs, footprint_m=100.0)
+        AcceptFlight("flight", Path("map.tif"), None, truth, frame_refs, footprint_m=100.0)
     )
     assert isinstance(plan, Plan)
     assert plan.marks.spans[0].from_s >= 0.5 * 40 and plan.marks.spans[0].to_s < 0.5 * 58

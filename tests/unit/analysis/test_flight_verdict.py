@@ -58,8 +58,14 @@ def test_spans_without_a_certain_position_are_excluded_with_a_reason() -> None:
     verdict = flight_verdict(flown)
     assert verdict.label == "trust it in part"
     assert verdict.spans == [(0.0, 9.0), (20.0, 29.0), (31.0, 59.0)]
+    assert "no position" in verdict.text()
+    assert "from 0.0 s (0.jpg) to 9.0 s (9.jpg), from 20.0 s (20.jpg)" in verdict.text()
+    assert verdict.as_json()["trusted_files"] == [["0.jpg", "9.jpg"], ["20.jpg", "29.jpg"], ["31.jpg", "59.jpg"]]
+    assert verdict.as_json()["untrusted_files"] == [["10.jpg", "19.jpg"], ["30.jpg", "30.jpg"]]
+    for row in flown:  # of a camera, whose images have no names
+        row.file = ""
+    assert "from 0.0 s to 9.0 s, from 20.0 s" in flight_verdict(flown).text()
     assert verdict.reasons == ["claims worse than 50 m", "no position"]
-    assert "from 0.0 s to 9.0 s" in verdict.text() and "no position" in verdict.text()
 
 
 @pytest.mark.parametrize(("age_ms", "trusted"), [(35_000, True), (35_001, False)])

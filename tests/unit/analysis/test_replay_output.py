@@ -66,10 +66,19 @@ class StubEstimator:
                     yield estimate(i, 999.0, 999.0)
                     yield estimate(i, 10.0 * i, -10.0)
             case m.SourceEnded():
-                for offset_m in (5.0, 0.0):
+                for offset_m, m_per_unit in ((5.0, 1.25), (0.0, None)):
                     lat_deg, lon_deg = ORIGIN.to_wgs84(0.0, offset_m)
                     pose = m.RefinedPose(
-                        frame_id=1, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=0.0, sigma_e_m=1.0, sigma_n_m=1.0
+                        frame_id=1,
+                        lat_deg=lat_deg,
+                        lon_deg=lon_deg,
+                        alt_amsl_m=612.5,
+                        sigma_e_m=1.0,
+                        sigma_n_m=1.0,
+                        fragment_id=3,
+                        q_w_c=(0.5, 0.5, 0.5, -0.5),
+                        cov=tuple(np.eye(6).ravel().tolist()),
+                        m_per_unit=m_per_unit,
                     )
                     yield m.Refinement(t_ns=message.t_ns, poses=[pose])
             case _:
@@ -121,6 +130,10 @@ def test_a_replay_writes_three_files_and_one_row_per_frame(folder: Path, tmp_pat
     assert all(float(r["process_ms"]) > 0 for r in rows)
     assert [bool(r["refined_lat_deg"]) for r in rows] == [i == 1 for i in range(FRAMES)]
     assert float(rows[1]["refined_lat_deg"]) == pytest.approx(48.0, abs=1e-8)  # the last refinement
+    whole = [rows[1][f"refined_{name}"] for name in ("alt_amsl_m", "q_w_c", "m_per_unit", "fragment_id")]
+    assert whole == ["612.500", "0.5 0.5 0.5 -0.5", "1.2500", "3"]  # the scale of the one before, which alone states it
+    assert [float(v) for v in rows[1]["refined_cov"].split()] == np.eye(6).ravel().tolist()
+    assert read_rows(tmp_path / "out" / "estimates.csv")[1].refined_fragment_id == 3
     assert summary == json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["frames"], summary["localised"], summary["odometry_frames"]) == (FRAMES, FRAMES - 1, FRAMES - 2)
     assert summary["verdicts"]["odometry"] == {"accepted": FRAMES - 1, "bad_image": 1}

@@ -88,7 +88,10 @@ def test_the_report_has_calibration_faults_and_the_verdict(tmp_path: Path) -> No
     write_record(tmp_path / "flight-000.mcap", [*live_messages(), wrong, right])
     text = page_of(tmp_path).text
     assert "Height/focal seems x2.00 off: no fix: stated against measured." in text
-    assert "Verdict: Trust it from 8.0 s to 9.5 s, and no more than that (height/focal seems x2.00 off)." in text
+    assert (
+        "Verdict: Trust it from 8.0 s (0016.jpg) to 9.5 s (0019.jpg), and no more than that "
+        "(height/focal seems x2.00 off)." in text
+    )
 
 
 def test_the_report_has_the_rejected_map_matches_with_the_largest_test_ratios(tmp_path: Path) -> None:

@@ -346,7 +346,7 @@ def test_a_new_origin_resets_the_localizer(ground: np.ndarray) -> None:
         assert vars(node._localizer)[name] == fresh[name], name
 
 
-class TwoDates:
+class TwoLayers:
     """The newest layer shows other ground, as after construction; the older one is right and states its accuracy."""
 
     manifest = SimpleNamespace(
@@ -365,7 +365,7 @@ class TwoDates:
 
 @pytest.mark.slow
 def test_the_layer_that_fits_is_selected_in_flight(ground: np.ndarray) -> None:
-    package: Any = TwoDates(ground)
+    package: Any = TwoLayers(ground)
     frames = MemoryFrameStore(8)
     node = AnchorNode(frames, package, GradientDescriber(), 10.0)
     list(node.on(ORIGIN))

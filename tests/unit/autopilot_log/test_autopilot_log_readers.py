@@ -22,10 +22,11 @@ from autopilot_logs import (
     write_tlog,
     write_ulog,
 )
+from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
+from terrafix.core.autopilot_log.dataflash import read_dataflash
 from terrafix.core.errors import SourceError
-from terrafix_tools.autopilot_log.dataflash import read_dataflash
 from terrafix_tools.autopilot_log.read import is_autopilot_log, read_autopilot_log
-from terrafix_tools.autopilot_log.structure import Attitude, AutopilotLog, Event, cleaned
+from terrafix_tools.autopilot_log.structure import AutopilotLog, LogEvent
 
 S = 1_000_000
 FLOWN = part(flight(seed=1), 20.0, 24.0)
@@ -169,7 +170,7 @@ def test_damaged_times_and_angles_are_left_out_of_the_attitude() -> None:
     t_s = np.array([1.0, 2.0, 9e9, 3.0, 3.0, 2.5, 4.0, np.nan, 5.0, 6.0])
     roll_rad = np.arange(10.0)
     roll_rad[8] = np.nan
-    kept = cleaned(Attitude(t_s, roll_rad, np.zeros(10), np.zeros(10)))
+    kept = cleaned(AttitudeSeries(t_s, roll_rad, np.zeros(10), np.zeros(10)))
     assert (kept.t_s.tolist(), kept.roll_rad.tolist()) == ([1.0, 2.0, 3.0, 4.0, 6.0], [0.0, 1.0, 3.0, 6.0, 9.0])
 
 
@@ -208,7 +209,7 @@ def test_the_real_log_of_2015_is_read(data_set: Callable[[str], Path]) -> None:
     assert log.span_s == pytest.approx((11.478, 253.981))
     assert (len(log.attitude.t_s), log.counts["IMU"], len(log.gps[0].t_s)) == (2383, 11916, 1199)
     assert log.gps[0].lat_deg[-1] == pytest.approx(-35.36, abs=0.01) and set(log.gps[0].fix_type) == {1.0, 3.0}
-    assert Event(217.209, "mode", "acro") in log.events
+    assert LogEvent(217.209, "mode", "acro") in log.events
     assert log.ratios[0].values["velocity"].max() == pytest.approx(3.09)
 
 
@@ -224,9 +225,9 @@ def test_telemetry_has_the_autopilots_time_over_a_restart(tmp_path: Path) -> Non
     assert log.rates is not None and log.rates.rates_radps[0] == pytest.approx([0.1, 0.2, 0.3])
 
 
-def _shifted(log: AutopilotLog, by_s: float) -> Attitude:
+def _shifted(log: AutopilotLog, by_s: float) -> AttitudeSeries:
     found = log.attitude
-    return Attitude(found.t_s + by_s, found.roll_rad, found.pitch_rad, found.yaw_rad)
+    return AttitudeSeries(found.t_s + by_s, found.roll_rad, found.pitch_rad, found.yaw_rad)
 
 
 def test_telemetry_has_modes_texts_receivers_and_status_of_the_ekf(tmp_path: Path) -> None:

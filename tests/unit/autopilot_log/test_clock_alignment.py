@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from autopilot_logs import DRIFT, OFFSET_S, flight, part, telemetry
+from terrafix.core.autopilot_log.alignment import align, body_rates
+from terrafix.core.autopilot_log.attitude import AttitudeSeries
+from terrafix.core.autopilot_log.correlation import LagPeak, correlate, needed_height, needed_lead
 from terrafix.core.errors import EvaluationError
-from terrafix_tools.autopilot_log.alignment import align, body_rates
 from terrafix_tools.autopilot_log.ardupilot import read_ardupilot
-from terrafix_tools.autopilot_log.correlation import Peak, correlate, needed_height, needed_lead
-from terrafix_tools.autopilot_log.structure import Attitude
 
 LIMIT_S = 0.020  # error over the whole flight
 
 
-def worst_error_s(record: Attitude, log: Attitude, true_s: Callable[[np.ndarray], np.ndarray]) -> float:
+def worst_error_s(record: AttitudeSeries, log: AttitudeSeries, true_s: Callable[[np.ndarray], np.ndarray]) -> float:
     at_s = np.linspace(record.t_s[0], record.t_s[-1], 50)
     return float(np.abs(align(record, log).to_log(at_s) - true_s(at_s)).max())
 
@@ -35,7 +35,9 @@ def test_without_latency_offset_and_drift_are_right_within_three_standard_errors
         log = flight(seed=seed, duration_s=300.0)
         record, true_s = telemetry(log, seed=seed, rate_hz=25.0, jitter_s=0.0)
         noise = np.random.default_rng(seed).normal(0.0, 2e-3, (3, record.t_s.size))
-        noisy = Attitude(record.t_s, record.roll_rad + noise[0], record.pitch_rad + noise[1], record.yaw_rad + noise[2])
+        noisy = AttitudeSeries(
+            record.t_s, record.roll_rad + noise[0], record.pitch_rad + noise[1], record.yaw_rad + noise[2]
+        )
         found = align(noisy, log)
         true_offset_s = true_s(np.array([found.middle_s]))[0] - found.middle_s
         offsets.append((found.offset_s - true_offset_s) / found.offset_sigma_s)
@@ -56,7 +58,7 @@ def test_times_are_mapped_both_ways() -> None:
 def test_a_heading_that_is_wrong_and_a_trim_do_not_move_the_clock() -> None:
     log = flight(seed=4)
     record, true_s = telemetry(log, seed=4, rate_hz=25.0)
-    turned = Attitude(record.t_s, record.roll_rad + 0.03, record.pitch_rad - 0.02, record.yaw_rad + 0.5)
+    turned = AttitudeSeries(record.t_s, record.roll_rad + 0.03, record.pitch_rad - 0.02, record.yaw_rad + 0.5)
     assert worst_error_s(turned, log, true_s) < LIMIT_S
 
 
@@ -87,7 +89,7 @@ def test_a_flight_of_the_same_manoeuvres_at_slightly_other_times_is_refused() ->
     record, _ = telemetry(log, seed=11, rate_hz=25.0)
     again_s = log.t_s + 0.15 * np.sin(log.t_s / 15.0)
     with pytest.raises(EvaluationError, match=r"rates correlate by 0\.\d+ .* and its time scatters by 1\d\d ms"):
-        align(record, Attitude(again_s, log.roll_rad, log.pitch_rad, log.yaw_rad))
+        align(record, AttitudeSeries(again_s, log.roll_rad, log.pitch_rad, log.yaw_rad))
 
 
 def test_a_log_that_explains_half_of_the_motion_is_refused_though_its_time_is_steady() -> None:
@@ -95,7 +97,7 @@ def test_a_log_that_explains_half_of_the_motion_is_refused_though_its_time_is_st
     record, _ = telemetry(log, seed=12, rate_hz=25.0)
     vibration = 0.06 * np.sin(2 * np.pi * 1.3 * log.t_s)
     with pytest.raises(EvaluationError, match=r"rates correlate by 0\.[67]\d \(0\.80 .* scatters by \d ms"):
-        align(record, Attitude(log.t_s, log.roll_rad + vibration, log.pitch_rad - vibration, log.yaw_rad))
+        align(record, AttitudeSeries(log.t_s, log.roll_rad + vibration, log.pitch_rad - vibration, log.yaw_rad))
 
 
 @pytest.mark.parametrize(
@@ -108,7 +110,7 @@ def test_a_log_that_explains_half_of_the_motion_is_refused_though_its_time_is_st
     ],
 )
 def test_a_peak_must_be_high_and_lead(correlation: float, second: float, sigma: float, distinct: bool) -> None:
-    peak = Peak(0.0, 0.0, correlation, second, sigma, lags=1000)
+    peak = LagPeak(0.0, 0.0, correlation, second, sigma, lags=1000)
     assert peak.distinct is distinct and peak.needed < 1.0
 
 
@@ -116,7 +118,7 @@ def test_without_motion_the_refusal_is_about_motion() -> None:
     t_s = np.arange(0.0, 60.0, 0.1)
     noise = np.random.default_rng(0).normal(0.0, 1e-5, (3, t_s.size))
     with pytest.raises(EvaluationError, match=r"^too little motion to align the clocks: the record has"):
-        align(Attitude(t_s, *noise), flight(seed=9))
+        align(AttitudeSeries(t_s, *noise), flight(seed=9))
 
 
 def test_a_few_seconds_of_attitude_are_too_little() -> None:
@@ -128,9 +130,9 @@ def test_a_motion_that_only_repeats_itself_is_refused_as_uniform() -> None:
     """A circle of 10 s swung for two minutes has a best lag at every turn."""
     t_s = np.arange(0.0, 120.0, 0.04)
     roll = 0.3 * np.sin(2 * np.pi * t_s / 10.0)
-    swinging = Attitude(t_s, roll, 0.5 * roll, np.zeros(t_s.size))
+    swinging = AttitudeSeries(t_s, roll, 0.5 * roll, np.zeros(t_s.size))
     with pytest.raises(EvaluationError, match="too short or too uniform"):
-        align(Attitude(t_s + 5.0, roll, 0.5 * roll, np.zeros(t_s.size)), swinging)
+        align(AttitudeSeries(t_s + 5.0, roll, 0.5 * roll, np.zeros(t_s.size)), swinging)
 
 
 def test_needed_height_and_lead_hold_for_noise() -> None:
@@ -150,7 +152,7 @@ def test_needed_height_and_lead_hold_for_noise() -> None:
 def test_body_rates_are_those_of_the_rotation_between_grid_points() -> None:
     """A turn at 0.2 rad/s with 0.5 rad of roll has pitch and yaw rates in body axes, and a gap has none."""
     t_s = np.concatenate([np.arange(0.0, 5.0, 0.05), np.arange(8.0, 12.0, 0.05)])
-    turning = Attitude(t_s, np.full(t_s.size, 0.5), np.zeros(t_s.size), 0.2 * t_s)
+    turning = AttitudeSeries(t_s, np.full(t_s.size, 0.5), np.zeros(t_s.size), 0.2 * t_s)
     _, rates, known = body_rates(turning, 0.1)
     assert rates[known] == pytest.approx(
         np.tile([0.0, 0.2 * np.sin(0.5), 0.2 * np.cos(0.5)], (int(known.sum()), 1)), abs=1e-6

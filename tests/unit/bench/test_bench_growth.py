@@ -71,6 +71,7 @@ def test_the_growth_benchmark_has_all_fields() -> None:
     assert found["update_cpu_ms"]["p99"] > found["update_cpu_ms"]["median"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_map_size_benchmark_has_all_fields(tmp_path: Path) -> None:
     built = map_size.measure(0.25, tmp_path)

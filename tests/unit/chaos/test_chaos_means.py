@@ -20,7 +20,7 @@ from terrafix_lab.chaos.camera import camera_toml
 from terrafix_lab.chaos.memory_group import V1, V2, MemoryGroup
 from terrafix_lab.chaos.recorded_scene import recorded_scene
 from terrafix_lab.chaos.run import fly_cell, missing_here
-from terrafix_lab.chaos.scene import Scene
+from terrafix_lab.chaos.scene import ChaosScene
 from terrafix_lab.chaos.serial_line import SerialLine
 from terrafix_lab.chaos.switches import Switch, Switches
 from terrafix_lab.chaos.verdict import sigmas
@@ -143,7 +143,7 @@ def test_a_fault_that_cannot_be_caused_here_says_why(tmp_path: Path, monkeypatch
     assert missing_here(fault("disk: gone"), tmp_path) == "mounting needs root"
     assert missing_here(fault("model: provider lost"), tmp_path / "none.onnx") == "no weights of XFeat, see --model"
     assert missing_here(fault("link: other baud rate"), tmp_path) == ""
-    empty = Scene(tmp_path, [], lambda _t_s: None, {}, 0.0)  # type: ignore[arg-type,return-value]
+    empty = ChaosScene(tmp_path, [], lambda _t_s: None, {}, 0.0)  # type: ignore[arg-type,return-value]
     outcome = fly_cell(empty, fault("disk: full"), Phase.CRUISE, tmp_path / "cell", seed=1)
     assert outcome.verdict == "not measurable here: mounting needs root" and not (tmp_path / "cell").exists()
 

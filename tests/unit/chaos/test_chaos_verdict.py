@@ -14,7 +14,7 @@ from terrafix_lab.chaos import run, verdict
 from terrafix_lab.chaos.camera import StreamedCamera
 from terrafix_lab.chaos.rig import Rig
 from terrafix_lab.chaos.run import Results
-from terrafix_lab.chaos.scene import AGL_M, Scene, phases
+from terrafix_lab.chaos.scene import AGL_M, ChaosScene, phases
 from terrafix_lab.chaos.table import table, write_table
 from terrafix_lab.chaos.verdict import Outcome
 from terrafix_lab.faults.edits import Edit, Span, unchanged, unchanged_origin
@@ -181,7 +181,7 @@ def test_the_phases_of_a_flight_are_found_by_height_and_heading() -> None:
     assert 60.0 < found[Phase.CRUISE] < 110.0 and abs(found[Phase.CRUISE] - 81.5) > 5.0
 
 
-class Recorded(FrameStream):
+class KeptStream(FrameStream):
     """A stream that keeps what is pushed."""
 
     def __init__(self) -> None:
@@ -195,7 +195,7 @@ class Recorded(FrameStream):
 def test_each_image_is_stamped_with_its_own_time_whatever_the_phase_of_the_flight() -> None:
     began_s = time.monotonic() - 0.2  # the images of the flight exist at 0, 0.5, 1 s ...
     with (
-        Recorded() as stream,
+        KeptStream() as stream,
         StreamedCamera(stream, lambda t_s: f"{t_s:.3f}".encode(), lambda: time.monotonic() - began_s),
     ):
         time.sleep(1.2)
@@ -236,7 +236,7 @@ def sent(name: str) -> list[tuple[bytes, int]]:
     """Images and stamps of 0.5 s of a camera of 10 Hz with the fault."""
     began_s = time.monotonic()
     with (
-        Recorded() as stream,
+        KeptStream() as stream,
         StreamedCamera(stream, lambda _t_s: jpeg(), lambda: time.monotonic() - began_s, 10.0) as camera,
     ):
         camera.edit = FAULTS[name].of_camera(Span(0.0, 1e9, name))
@@ -261,7 +261,7 @@ class HeldInTheAir:
     """The part of the rig that a cell uses, with a fix 2 m off each 0.1 s."""
 
     def __init__(self) -> None:
-        self.began_s, self.scene = time.monotonic() - 10.0, Scene(Path(), [], copter, {}, 0.0)
+        self.began_s, self.scene = time.monotonic() - 10.0, ChaosScene(Path(), [], copter, {}, 0.0)
         self.camera, self.peer, self.edits = self, self, list[tuple[str, str]]()
         self.received_s: list[float] = []
         self.pushed_s = [self.began_s + 0.5 * k for k in range(100)]
@@ -299,7 +299,7 @@ def test_a_cell_hands_each_part_of_a_fault_to_its_own_and_takes_it_back(
 
 def test_a_false_start_and_camera_are_in_the_configuration_that_the_processes_read(tmp_path: Path) -> None:
     (tmp_path / "map").write_bytes(b"map")
-    scene = Scene(tmp_path / "map", [], copter, {}, 0.0)
+    scene = ChaosScene(tmp_path / "map", [], copter, {}, 0.0)
     for name, has_start, focal in (("focal length doubled", True, 2.0), ("start unknown", False, 1.0)):
         rig = Rig(scene, tmp_path / name, 60.0, seed=1, origin=FAULTS[name].origin or unchanged_origin)
         try:

@@ -9,7 +9,7 @@ import pytest
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.repeated_picture import HISTORY
-from terrafix_lab.chaos.scene import LEG_M, Scene, course_of
+from terrafix_lab.chaos.scene import LEG_M, ChaosScene, course_of
 from terrafix_lab.chaos.shuttle import WAY, A, endless, lap_of, lap_steps
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights.folder import FRAME_HZ, Flight
@@ -52,7 +52,7 @@ def flown() -> Flight:
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Scene:
+def scene(tmp_path: Path) -> ChaosScene:
     lap = lap_of(flown())
     (tmp_path / "frames").mkdir()
     for i in range(len(lap.frame_times_s())):
@@ -71,7 +71,7 @@ def test_a_lap_lasts_whole_periods_of_the_camera_from_the_first_leg_until_it_is_
 
 
 def test_position_and_attitude_have_no_jump_and_the_velocity_is_that_of_the_position_where_laps_join(
-    scene: Scene,
+    scene: ChaosScene,
 ) -> None:
     lap_s = len(scene.jpegs) / scene.frame_hz
     times_s = lap_s + np.arange(-1.0, 1.0, 0.01)
@@ -86,7 +86,7 @@ def test_position_and_attitude_have_no_jump_and_the_velocity_is_that_of_the_posi
     assert (later.lat_deg, later.lon_deg, later.yaw_rad) == pytest.approx((first.lat_deg, first.lon_deg, first.yaw_rad))
 
 
-def test_no_image_is_one_of_those_that_vision_takes_for_a_stale_buffer(scene: Scene) -> None:
+def test_no_image_is_one_of_those_that_vision_takes_for_a_stale_buffer(scene: ChaosScene) -> None:
     count = len(scene.jpegs)
     seen = [scene.jpeg(i / scene.frame_hz) for i in range(2 * count)]
     assert seen[count:] == seen[:count], "lap for lap the same"

@@ -14,7 +14,7 @@ from console_rig import NEW, Console, batch, settings
 from terrafix.core.errors import ConfigError, UsageError
 from terrafix_tools.console.access import access_of, read_tokens
 from terrafix_tools.console.payloads import Role
-from terrafix_tools.console.settings import Limits
+from terrafix_tools.console.settings import ServiceLimits
 
 OPERATOR, VIEWER = "operator-" + "o" * 20, "viewer-" + "v" * 20
 TOKENS = f"""[tokens]
@@ -173,6 +173,6 @@ def test_with_a_certificate_it_speaks_tls_and_the_cookie_is_for_tls_only(tmp_pat
 
 
 def test_event_streams_are_bounded(tmp_path: Path) -> None:
-    with Console(settings(tmp_path, limits=Limits(event_clients=0))) as console:
+    with Console(settings(tmp_path, limits=ServiceLimits(event_clients=0))) as console:
         flight_id = console.create()
         assert console.send("GET", f"/flights/{flight_id}/events").status == 429

@@ -11,6 +11,7 @@ from console_rig import NEW, Console, settings
 from terrafix_tools.console import connections, guard
 from terrafix_tools.console.events import ProcessingBlocked
 from terrafix_tools.console.store import flights
+from terrafix_tools.console.store.database import FILE
 
 pytestmark = pytest.mark.real_time
 WAIT_S = 20.0
@@ -109,3 +110,16 @@ def test_connections_beyond_the_limit_are_closed(console: Console, monkeypatch: 
         assert ended(third)
         first.sendall(HEAD + b"\r\n")
         assert first.recv(4096).startswith(b"HTTP/1.1 200")
+
+
+def test_the_end_of_the_service_closes_the_database_after_its_processes(tmp_path: Path) -> None:
+    """SQLite removes its log with the last connection: what the end of a process reads or writes is before that."""
+    with Console(settings(tmp_path)) as console:
+        service, processes_end = console.service, console.service.workers.stop
+
+        async def stored_at_the_end() -> None:
+            await processes_end()
+            assert service.flights().flights == []
+
+        service.workers.stop = stored_at_the_end  # type: ignore[method-assign]
+    assert (tmp_path / FILE).is_file() and not (tmp_path / f"{FILE}-wal").exists()

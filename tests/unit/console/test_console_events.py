@@ -49,9 +49,14 @@ def test_names_of_events_are_those_of_the_contract() -> None:
         "user_input_needed",
         "processing_blocked",
         "chunk_merged",
+        "fragment_changed",
+        "recovery_started",
+        "recovery_succeeded",
+        "user_fix_applied",
         "state_changed",
         "verdict_given",
         "hint_answered",
+        "finalise_progress",
         "flight_completed",
         "health",
     ]
@@ -67,6 +72,20 @@ def test_a_file_of_the_time_before_versions_keeps_its_flights(database: Database
         with opened.read() as db:
             assert [flight.flight_id for flight in flights.all_flights(db)] == [flight_id]
         opened.close()
+
+
+def test_a_file_of_the_version_before_keeps_its_fragments(database: Database, tmp_path: Path) -> None:
+    flight_id = new_flight(database)
+    database.close()
+    with closing(sqlite3.connect(tmp_path / FILE)) as former:
+        former.executescript("PRAGMA user_version = 1; ALTER TABLE fragments DROP COLUMN state;")
+        former.execute("INSERT INTO fragments VALUES (?, 2, 0, 5, 6, 1, NULL)", (flight_id,))
+        former.commit()
+    opened = open_database(tmp_path)
+    with opened.read() as db:
+        (fragment,) = flights.flight_of(db, flight_id).fragments
+    assert (fragment.fragment_id, fragment.frames, fragment.state) == (2, 6, "unanchored")
+    opened.close()
 
 
 def test_a_file_with_tables_of_a_later_version_is_refused(database: Database, tmp_path: Path) -> None:

@@ -78,11 +78,13 @@ def test_a_lost_flight_asks_goes_on_by_a_user_fix_and_is_refined_at_its_end(tmp_
         assert [event.event_id for event in watched.seen] == [*range(1, len(watched.seen) + 1)]
         assert {event.name for event in watched.seen} >= {"frame_refined", "verdict_given"}
         names = [file["name"] for file in console.send("GET", f"/flights/{flight_id}/recordings").json["files"]]
-        assert names == ["estimates.csv", "flight.mcap", "summary.json"]
+        assert names == ["finalised.csv", "estimates.csv", "finalised.json", "flight.mcap", "summary.json"]
         record = console.send("GET", f"/flights/{flight_id}/recordings/flight.mcap")
         assert record.body.startswith(b"\x89MCAP")
         refined = [r for r in client.results(flight_id, refined=True).results if r.refined]
         assert len(refined) == statistics["refined"]
+        applied = [event for event in watched.seen if event.name == "user_fix_applied"]
+        assert applied or [e for e in watched.seen if e.data.get("measurement") == "user_fix"], "gated as a measurement"
 
 
 def stored(client: ConsoleClient, flight_id: str) -> list[Any]:
@@ -115,6 +117,16 @@ def undisturbed(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Undistu
         expected = stored(client, flight_id)
     assert len(expected[0][0]) == len(FRAMES)
     return Undisturbed(new, images, expected)
+
+
+def test_a_completed_flight_is_solved_as_a_whole_and_that_is_its_refined_result(undisturbed: Undisturbed) -> None:
+    (_, refined), _, events = undisturbed.expected
+    (statistics,) = [data["statistics"] for name, data in events if name == "flight_completed"]
+    assert statistics["finalised"] == len(FRAMES) and not statistics["not_finalised"]
+    assert {result.refined_by for result in refined} == {"finalised"}
+    assert all(len(r.orientation or []) == 4 and len(r.covariance or []) == 36 and r.m_per_unit for r in refined)
+    stages = [data["stage"] for name, data in events if name == "finalise_progress"]
+    assert {"read", "smooth"} <= {*stages} and len(stages) <= 30
 
 
 def killed_at(data: Path, maps: Path, flight: Undisturbed) -> Iterator[Any]:
@@ -164,6 +176,7 @@ def flown_by(cluster: LocalCluster, data: Path, maps: Path, flight: Undisturbed)
         return stored(client, flight_id)
 
 
+@pytest.mark.nightly
 def test_a_cluster_whose_worker_is_killed_gives_the_results_and_events_of_this_computer(
     tmp_path: Path, maps: Path, undisturbed: Undisturbed
 ) -> None:

@@ -41,7 +41,7 @@ def owned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OwnedRunDir:
     return made
 
 
-class Flying:
+class LiveProcesses:
     """Processes that publish a frame with its estimate and match every 20 ms. ``lost``: a search asks for help."""
 
     def __init__(self, run: RunDir) -> None:
@@ -83,8 +83,8 @@ class Flying:
 
 
 @pytest.fixture
-def flying(owned: OwnedRunDir) -> Iterator[Flying]:
-    running = Flying(owned.run_dir)
+def flying(owned: OwnedRunDir) -> Iterator[LiveProcesses]:
+    running = LiveProcesses(owned.run_dir)
     yield running
     running.stop()
     owned.remove()
@@ -99,7 +99,9 @@ def soon(found: Callable[[], Any]) -> Any:
     return result
 
 
-def test_a_live_flight_has_results_events_health_and_an_end(owned: OwnedRunDir, flying: Flying, tmp_path: Path) -> None:
+def test_a_live_flight_has_results_events_health_and_an_end(
+    owned: OwnedRunDir, flying: LiveProcesses, tmp_path: Path
+) -> None:
     chosen = settings(tmp_path / "data", bus=str(owned.run_dir.path))
     with Console(chosen) as console:
         (flight,) = soon(lambda: console.send("GET", "/flights").json["flights"])
@@ -128,7 +130,7 @@ def test_a_live_flight_has_results_events_health_and_an_end(owned: OwnedRunDir, 
 
 
 def test_a_flight_that_ended_without_a_service_is_completed_by_the_next_one(
-    owned: OwnedRunDir, flying: Flying, tmp_path: Path
+    owned: OwnedRunDir, flying: LiveProcesses, tmp_path: Path
 ) -> None:
     chosen = settings(tmp_path / "data", bus=str(owned.run_dir.path))
     with Console(chosen) as console:
@@ -144,7 +146,7 @@ def test_a_flight_that_ended_without_a_service_is_completed_by_the_next_one(
 
 
 def test_a_live_flight_that_is_lost_shows_the_places_of_its_search(
-    owned: OwnedRunDir, flying: Flying, tmp_path: Path
+    owned: OwnedRunDir, flying: LiveProcesses, tmp_path: Path
 ) -> None:
     with Console(settings(tmp_path / "data", bus=str(owned.run_dir.path))) as console:
         (flight,) = soon(lambda: console.send("GET", "/flights").json["flights"])
@@ -160,7 +162,7 @@ def test_a_live_flight_that_is_lost_shows_the_places_of_its_search(
 
 
 def test_a_hint_goes_the_way_of_the_command(
-    owned: OwnedRunDir, flying: Flying, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    owned: OwnedRunDir, flying: LiveProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[Any] = []
     monkeypatch.setattr(live, "send_hint", lambda *given: sent.append(given) or "hint agrees, 3 m from the estimate")
@@ -173,7 +175,7 @@ def test_a_hint_goes_the_way_of_the_command(
 
 
 def test_a_console_that_hangs_does_not_slow_down_the_flight(
-    owned: OwnedRunDir, flying: Flying, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    owned: OwnedRunDir, flying: LiveProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The thread that reads the bus stops reading while 200 frames are published."""
     hang = threading.Event()

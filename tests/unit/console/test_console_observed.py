@@ -13,18 +13,22 @@ from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome
 from terrafix_tools.console.events import (
     ChunkMerged,
     Event,
+    FragmentChanged,
     FrameRefined,
     HintAnswered,
+    RecoveryStarted,
+    RecoverySucceeded,
     SearchExpanded,
     StateChanged,
+    UserFixApplied,
     UserInputNeeded,
     VerdictGiven,
     name_of,
 )
-from terrafix_tools.console.payloads import FlightState
+from terrafix_tools.console.payloads import FlightState, FragmentState
 
 
-class Flight:
+class ObservedFlight:
     """A flight, frame by frame."""
 
     def __init__(self) -> None:
@@ -55,7 +59,7 @@ LOST, WIDEN, WHOLE, ASK = m.Verdict.LOST, m.SearchStep.WIDEN, m.SearchStep.WHOLE
 
 
 def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     outcome = flight.frame(m.Verdict.ACCEPTED)
     result = outcome.result
     assert result is not None and result.gps is not None and result.ellipse is not None
@@ -64,7 +68,7 @@ def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
     assert result.ellipse.semi_major_m == pytest.approx(4.0 * math.sqrt(5.991), abs=0.01)
     assert result.confidence == pytest.approx(1.0 - math.exp(-(20.0**2) / (2 * 4.0**2)), abs=1e-4)
     assert outcome.heading == (90.0, pytest.approx(math.degrees(0.1)))
-    assert [name_of(type(e)) for e in outcome.events] == ["frame_processed"]
+    assert [name_of(type(e)) for e in outcome.events] == ["frame_processed", "fragment_changed"]
 
 
 def test_the_ellipse_points_along_its_longer_axis() -> None:
@@ -79,7 +83,7 @@ def test_the_confidence_is_that_of_the_worse_axis() -> None:
 
 
 def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.frame(m.Verdict.ACCEPTED)
     flight.searches(1)
     lost = flight.frame(LOST, WIDEN)
@@ -118,7 +122,7 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
 
 
 def test_a_flight_that_is_lost_when_its_images_are_through_asks_once() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     for step in (WIDEN, WHOLE):
         flight.frame(LOST, step)
         assert flight.observer.images_through() is None  # two frames are no lost flight
@@ -134,8 +138,53 @@ def test_a_flight_that_is_lost_when_its_images_are_through_asks_once() -> None:
     assert flight.observer.images_through() is None
 
 
+def test_a_fragment_that_begins_joined_is_merged_with_its_first_frame() -> None:
+    flight = ObservedFlight()
+    assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
+    outcome = flight.frame(m.Verdict.UNCONFIRMED, fragment=1, joined=True)
+    assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=1, frames=1)]
+    assert flight.observer.completed().statistics["merged"] == 1
+
+
+def test_a_fragment_is_unanchored_then_matching_then_anchored_or_merged() -> None:
+    flight, states = ObservedFlight(), []
+    steps = [(m.Verdict.UNCONFIRMED, m.SearchStep.NORMAL), (LOST, WIDEN), (m.Verdict.ACCEPTED, m.SearchStep.NORMAL)]
+    for verdict, step in (*steps, (LOST, WHOLE)):
+        outcome = flight.frame(verdict, step, joined=False)
+        assert outcome.fragment is not None
+        states.append(outcome.fragment.state)
+    assert states == ["unanchored", "matching", "anchored", "anchored"]
+    began = flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=False)
+    merged = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
+    changed = [*of_kind(began, FragmentChanged), *of_kind(merged, FragmentChanged)]
+    assert changed == [
+        FragmentChanged(fragment_id=1, frame_id=4, state=FragmentState.UNANCHORED),
+        FragmentChanged(fragment_id=1, frame_id=5, state=FragmentState.MERGED),
+    ]
+
+
+def test_a_search_is_a_recovery_that_starts_and_succeeds_once() -> None:
+    flight = ObservedFlight()
+    flight.frame(m.Verdict.ACCEPTED)
+    (started,) = of_kind(flight.frame(LOST, WIDEN), RecoveryStarted)
+    assert started == RecoveryStarted(frame_id=1)
+    assert of_kind(flight.frame(LOST, ASK), RecoveryStarted, RecoverySucceeded) == []
+    (succeeded,) = of_kind(flight.frame(m.Verdict.ACCEPTED), RecoveryStarted, RecoverySucceeded)
+    assert succeeded == RecoverySucceeded(frame_id=3, frames=2)
+
+
+@pytest.mark.parametrize(("verdict", "kind"), [("accepted", UserFixApplied), ("innovation", VerdictGiven)])
+def test_a_user_fix_is_applied_or_refused_with_the_reason(verdict: str, kind: type[Event]) -> None:
+    flight = ObservedFlight()
+    flight.observer.take(
+        [m.MeasurementVerdict(t_ns=0, frame_id=0, measurement="user_fix", verdict=m.Verdict(verdict), detail="why")]
+    )
+    (event,) = of_kind(flight.frame(m.Verdict.UNCONFIRMED), UserFixApplied, VerdictGiven)[-1:]
+    assert isinstance(event, kind) and event.model_dump()["detail"] == "why"
+
+
 def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.frame(LOST, ASK)
     rejected = m.HintVerdict(
         t_ns=0, hint_t_ns=1, verdict=m.Verdict.OUTSIDE_MAP, distance_m=None, sigma_m=None, text="outside"
@@ -148,13 +197,13 @@ def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> No
 
 
 def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
     flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=False)
     outcome = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
     assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=2, frames=2)]
     assert outcome.fragment is not None and outcome.fragment.merged_at_frame == 2
-    assert of_kind(flight.frame(m.Verdict.ACCEPTED, fragment=1), ChunkMerged) == []
+    assert of_kind(flight.frame(m.Verdict.ACCEPTED, fragment=1), ChunkMerged, FragmentChanged) == []
     statistics = flight.observer.completed().statistics
     assert (statistics["frames"], statistics["localised"], statistics["fragments"], statistics["merged"]) == (
         4,
@@ -165,7 +214,7 @@ def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
 
 
 def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.observer.hints[77] = 3
     flight.observer.take(
         [
@@ -180,7 +229,16 @@ def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> 
                 source=m.RefinementSource.SMOOTHER,
                 poses=[
                     m.RefinedPose(
-                        frame_id=0, lat_deg=48.5, lon_deg=11.5, alt_amsl_m=600.0, sigma_e_m=2.0, sigma_n_m=1.0
+                        frame_id=0,
+                        lat_deg=48.5,
+                        lon_deg=11.5,
+                        alt_amsl_m=600.0,
+                        sigma_e_m=2.0,
+                        sigma_n_m=1.0,
+                        fragment_id=3,
+                        q_w_c=(1.0, 0.0, 0.0, 0.0),
+                        cov=tuple(range(36)),
+                        m_per_unit=1.25,
                     )
                 ],
             ),
@@ -198,11 +256,13 @@ def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> 
     (refined,) = outcome.refined
     assert of_kind(outcome, FrameRefined) == [refined]
     assert (refined.gps.lat, refined.source, refined.ellipse.bearing_deg) == (48.5, "smoother", 90.0)
+    assert (refined.fragment_id, refined.m_per_unit, refined.orientation) == (3, 1.25, [1.0, 0.0, 0.0, 0.0])
+    assert refined.covariance == [float(i) for i in range(36)]
     assert flight.observer.rest().events == []
 
 
 def test_an_image_without_position_has_a_result_with_its_error() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.observer.take([msgspec.structs.replace(frame(0), error="file is empty")])
     outcome = flight.observer.frame_done()
     assert outcome.result is not None

@@ -19,7 +19,7 @@ from console_rig import BOUNDARY, CAMERA, NEW, Answer, Console, batch, jpeg, mul
 from small_disk import small_disk
 from terrafix_tools.console import uploads
 from terrafix_tools.console.openapi import schema
-from terrafix_tools.console.settings import Limits
+from terrafix_tools.console.settings import ServiceLimits
 from terrafix_tools.console.store.database import FILE
 
 
@@ -54,6 +54,10 @@ def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
     assert answer.headers["location"] == f"/flights/{flight['flight_id']}"
     assert console.send("GET", answer.headers["location"]).json == flight
     assert flight in console.send("GET", "/flights").json["flights"]
+    config = console.send("GET", f"{answer.headers['location']}/config").json
+    assert config["flight"]["camera"]["fx"] == CAMERA["fx"] and config["flight"]["telemetry"]["yaw_sigma_deg"] == 5.0
+    assert (config["map"], config["config"]) == ("small", console.send("GET", "/config").json["flights"])
+    assert_refused(console.send("GET", f"/flights/{'0' * 16}/config"), 404)
     assert console.send("DELETE", answer.headers["location"]).status == 204
     assert_refused(console.send("GET", answer.headers["location"]), 404, flight["flight_id"])
 
@@ -250,7 +254,7 @@ def test_errors_of_http_itself_are_problems_too(console: Console) -> None:
 
 
 def test_limits_on_flights_and_images_are_refusals(tmp_path: Path) -> None:
-    limits = Limits(flights=1, images=15)
+    limits = ServiceLimits(flights=1, images=15)
     with Console(settings(tmp_path, limits=limits)) as console:
         flight_id = console.create()
         assert_refused(console.send("POST", "/flights", NEW), 429, "1 flights")
@@ -259,7 +263,7 @@ def test_limits_on_flights_and_images_are_refusals(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_refuses_uploads_and_leaves_the_flight_as_it_was(tmp_path: Path) -> None:
-    with Console(settings(tmp_path, limits=Limits(disk_reserve_bytes=2**60))) as console:
+    with Console(settings(tmp_path, limits=ServiceLimits(disk_reserve_bytes=2**60))) as console:
         flight_id = console.create()
         assert_refused(console.upload(flight_id, batch(1)), 507, "free")
         assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 0
@@ -267,7 +271,7 @@ def test_a_full_disk_refuses_uploads_and_leaves_the_flight_as_it_was(tmp_path: P
 
 def test_a_disk_that_fills_amid_an_upload_costs_that_upload_and_nothing_else(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk", 40) as disk:
-        with Console(settings(disk.folder, limits=Limits(disk_reserve_bytes=0))) as console:
+        with Console(settings(disk.folder, limits=ServiceLimits(disk_reserve_bytes=0))) as console:
             flight_id = console.create()
             assert console.upload(flight_id, batch(1)).status == 202
             for free_bytes in (0, 4096, 8192, 40960, 81920):
@@ -287,7 +291,7 @@ def test_a_disk_that_fills_amid_an_upload_costs_that_upload_and_nothing_else(tmp
 
 
 def test_an_upload_that_is_too_slow_makes_room_for_others(tmp_path: Path) -> None:
-    with Console(settings(tmp_path, limits=Limits(uploads=1, upload_s=0.2))) as console:
+    with Console(settings(tmp_path, limits=ServiceLimits(uploads=1, upload_s=0.2))) as console:
         path, body = f"/flights/{console.create()}/images/batch", multipart(batch(1))
         host, port = console.url.removeprefix("http://").split(":")
         head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nContent-Type: multipart/form-data; boundary={BOUNDARY}\r\n"

@@ -11,10 +11,11 @@ from terrafix.anchor.relocalization.position_prior import SIGMAS_95
 from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat, rot_w_b
 from terrafix.messages import Camera, NavEstimate
-from terrafix_tools.console.compute.steering import FIX_SIGMA_M, fix_message, hint_message
+from terrafix_tools.console.compute.steering import fix_message, hint_message
 from terrafix_tools.console.payloads import Hint, PixelPoint, UserFix
 
 CAMERA = Camera(width=800, height=600, fx=700.0, fy=710.0, cx=390.0, cy=310.0, mount_yaw_deg=20.0)
+FIX_SIGMA_M = 5.0  # of the service contract, RS-11
 TRUE_M = np.array([300.0, -120.0])  # where the vehicle is
 
 
@@ -42,13 +43,14 @@ def test_the_vehicle_is_where_its_camera_sees_the_place_at_the_pixel() -> None:
     assert message is not None
     assert ORIGIN.to_local(message.lat_deg, message.lon_deg) == pytest.approx(TRUE_M, abs=0.05)
     assert message.t_ns == 7 and message.radius_m > SIGMAS_95 * FIX_SIGMA_M
+    assert message.frame_id == 0 and message.sigma_m == pytest.approx(message.radius_m / SIGMAS_95)
 
 
 def test_a_fix_is_carried_on_by_odometry_within_a_fragment_and_grows_old_without() -> None:
     seen, newest = turned(estimate(0, 0.0, 0.0)), turned(estimate(9, 80.0, 60.0))
     at = pixel_of(seen, TRUE_M)
     carried = fix_message(fix(TRUE_M), at, CAMERA, {0: seen, 9: newest}, 123)
-    assert carried is not None and carried.t_ns == 123
+    assert carried is not None and (carried.t_ns, carried.frame_id) == (123, 9)
     assert ORIGIN.to_local(carried.lat_deg, carried.lon_deg) == pytest.approx(TRUE_M + np.array([80.0, 60.0]), abs=0.1)
     elsewhere = msgspec.structs.replace(newest, fragment_id=1)
     left = fix_message(fix(TRUE_M), at, CAMERA, {0: seen, 9: elsewhere}, 123)
@@ -61,6 +63,8 @@ def test_without_uncertainty_of_the_attitude_the_radius_is_that_of_the_place() -
     sure = msgspec.structs.replace(turned(estimate(0, 0.0, 0.0)), cov=tuple(cov.ravel().tolist()))
     message = fix_message(fix(TRUE_M), pixel_of(sure, TRUE_M), CAMERA, {0: sure}, 0)
     assert message is not None and message.radius_m == pytest.approx(SIGMAS_95 * FIX_SIGMA_M)
+    stated = fix_message(fix(TRUE_M).model_copy(update={"sigma_m": 2.0}), pixel_of(sure, TRUE_M), CAMERA, {0: sure}, 0)
+    assert stated is not None and stated.sigma_m == pytest.approx(2.0)
 
 
 def test_a_frame_without_attitude_and_a_pixel_of_the_sky_give_no_position() -> None:

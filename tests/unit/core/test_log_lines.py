@@ -48,7 +48,10 @@ LINES: list[tuple[m.Message, str]] = [
         for severity in severities
     ),
     *(
-        (m.SearchState(t_ns=7, step=m.SearchStep(step)), f"{level} search: search step, step {step}")
+        (
+            m.SearchState(t_ns=7, step=m.SearchStep(step)),
+            f"{level} search: search step, step {step}" + (", recovery RecoveryStarted" if level == "warning" else ""),
+        )
         for level, steps in STEPS.items()
         for step in steps
     ),
@@ -189,3 +192,12 @@ def test_lines_for_the_record_are_those_that_no_message_says() -> None:
     assert line.fields == {"source": "/dev/video0", "attempts": 2}
     assert codec.decode(codec.encode(line)) == line
     assert list(logs.take_lines()) == []
+
+
+def test_a_search_has_a_line_where_it_begins_and_where_it_has_found_the_position() -> None:
+    log, steps = MessageLog(), ("normal", "widen", "whole_map", "merge", "normal", "ask")
+    entries = [log.entry(m.SearchState(t_ns=7, step=m.SearchStep(step))) for step in steps]
+    assert [entry.fields.get("recovery") for entry in entries if entry is not None] == [
+        *(None, "RecoveryStarted", None, "RecoverySucceeded", None, "RecoveryStarted")
+    ]
+    assert [entry.level for entry in entries if entry is not None][3] == "info"

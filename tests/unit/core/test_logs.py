@@ -60,3 +60,30 @@ def test_an_event_that_repeats_is_limited_and_the_next_line_counts_what_was_left
     now[0] = logs.BURST_NS
     assert passed("no image") == {"event": "no image", "suppressed": 7}
     assert passed("no image") == {"event": "no image"}
+
+
+def test_the_record_has_warnings_and_errors_below_the_level_of_the_log() -> None:
+    writer = logs.configure("ERROR", "vision", stream := io.StringIO())
+    list(logs.take_lines(last=True))
+    for level in ("debug", "info", "warning", "error"):
+        getattr(logs.get(), level)(level)
+    writer.close()
+    assert [line["event"] for line in logs.take_lines()] == ["warning", "error"]
+    assert [json.loads(text)["event"] for text in stream.getvalue().splitlines()] == ["error"]
+
+
+def test_the_record_counts_every_line_that_the_limit_leaves_out_also_when_no_further_one_comes() -> None:
+    writer = logs.configure("INFO", "vision", io.StringIO())
+    list(logs.take_lines(last=True))
+    for _ in range(25):
+        logs.get().error("camera lost", todo="nothing")
+    written = list(logs.take_lines())
+    assert [line["event"] for line in written] == ["camera lost"] * logs.BURST
+    (count,) = logs.take_lines(last=True)
+    writer.close()
+    assert (count["event"], count["level"], count["fields"]) == (
+        "camera lost",
+        "error",
+        {"suppressed": 25 - logs.BURST},
+    )
+    assert list(logs.take_lines(last=True)) == []

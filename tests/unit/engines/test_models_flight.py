@@ -50,7 +50,7 @@ def no_gradient_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FrameMatcher, "_fix_with", fix_with)
 
 
-class Flight:
+class ModelFlight:
     """An anchor node with a model that fails on cells of pure blue, as ``blue`` has. ``seen``: the frame at TRUE_M."""
 
     def __init__(self, folder: Path, ground: np.ndarray, start_sigma_m: float = 10.0) -> None:
@@ -79,11 +79,11 @@ def ground() -> np.ndarray:
 
 
 @pytest.fixture
-def flight(tmp_path: Path, ground: np.ndarray) -> Flight:
-    return Flight(tmp_path, ground)
+def flight(tmp_path: Path, ground: np.ndarray) -> ModelFlight:
+    return ModelFlight(tmp_path, ground)
 
 
-def test_the_provider_and_the_reasons_against_better_ones_are_published(flight: Flight) -> None:
+def test_the_provider_and_the_reasons_against_better_ones_are_published(flight: ModelFlight) -> None:
     (event,) = flight.begun
     assert isinstance(event, ModelEvent)
     assert (event.t_ns, event.model, event.change) == (7, "xfeat", ModelChange.OPENED)
@@ -92,14 +92,14 @@ def test_the_provider_and_the_reasons_against_better_ones_are_published(flight: 
         assert str(over) in event.detail
 
 
-def test_without_need_the_model_does_not_run_and_the_match_says_so(flight: Flight) -> None:
+def test_without_need_the_model_does_not_run_and_the_match_says_so(flight: ModelFlight) -> None:
     match, events = flight.frame(flight.blue)
     assert (match.verdict, match.matcher, events) == (Verdict.ACCEPTED, "gradient", [])
     assert flight.describer.model.run_count == 0
 
 
 @pytest.mark.usefixtures("no_gradient_pose")
-def test_a_failed_inference_loses_one_frame_only(flight: Flight) -> None:
+def test_a_failed_inference_loses_one_frame_only(flight: ModelFlight) -> None:
     match, events = flight.frame(flight.blue)
     assert (match.verdict, match.search.step, match.matcher) == (Verdict.MODEL_FAILED, SearchStep.SKIP, "xfeat")
     assert match.pose is None
@@ -109,7 +109,7 @@ def test_a_failed_inference_loses_one_frame_only(flight: Flight) -> None:
 
 
 @pytest.mark.usefixtures("no_gradient_pose")
-def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(flight: Flight) -> None:
+def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(flight: ModelFlight) -> None:
     for _ in range(MAX_FAILURES):
         match, events = flight.frame(flight.blue)
     assert match.verdict is Verdict.MODEL_FAILED
@@ -120,7 +120,7 @@ def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(flight:
 
 
 @pytest.mark.usefixtures("no_gradient_pose")
-def test_only_consecutive_failures_count(flight: Flight) -> None:
+def test_only_consecutive_failures_count(flight: ModelFlight) -> None:
     for image in [*[flight.blue] * (MAX_FAILURES - 1), flight.seen, *[flight.blue] * (MAX_FAILURES - 1)]:
         match, _ = flight.frame(image)
     assert match.matcher == "xfeat"
@@ -129,7 +129,7 @@ def test_only_consecutive_failures_count(flight: Flight) -> None:
 
 
 @pytest.mark.usefixtures("no_gradient_pose")
-def test_a_learned_model_is_suspended_while_the_thermal_band_is_critical(flight: Flight) -> None:
+def test_a_learned_model_is_suspended_while_the_thermal_band_is_critical(flight: ModelFlight) -> None:
     changes = []
     for band in (ThermalBand.HOT, ThermalBand.CRITICAL, ThermalBand.CRITICAL, ThermalBand.NORMAL):
         health = Health(t_ns=0, band=band, temperature_c=96.0, throttled=False, disk_free_mb=None, cause="test")
@@ -140,7 +140,7 @@ def test_a_learned_model_is_suspended_while_the_thermal_band_is_critical(flight:
     assert changes == [("xfeat", []), ("gradient", suspended), ("gradient", []), ("xfeat", resumed)]
 
 
-def test_a_failed_provider_is_published(flight: Flight) -> None:
+def test_a_failed_provider_is_published(flight: ModelFlight) -> None:
     flight.describer.model.rejected_providers.append(RejectedProvider(CUDA, "failed while it ran: out of memory"))
     _, events = flight.frame(flight.seen)
     (event,) = events
@@ -155,7 +155,7 @@ def test_a_failing_model_during_a_search_leaves_the_search_state_unchanged(
         raise ModelRunError("no answer")
 
     monkeypatch.setattr(MapSearch, "process_frame", broken)
-    flight = Flight(tmp_path, ground, start_sigma_m=5000.0)
+    flight = ModelFlight(tmp_path, ground, start_sigma_m=5000.0)
     for _ in range(MAX_FAILURES):
         match, events = flight.frame(flight.seen, sigma_m=100.0)
         assert (match.verdict, match.search.sigma_m) == (Verdict.LOST, LOST_SIGMA_M)

@@ -52,7 +52,8 @@ def received_and_published(messages: Iterable[Message]) -> list[Message]:
 
 
 def health(band: ThermalBand, temperature_c: float, cause: str = "") -> Health:
-    return Health(t_ns=0, band=band, temperature_c=temperature_c, throttled=False, disk_free_mb=None, cause=cause)
+    known: dict[str, Any] = {"temperature_c": temperature_c, "cause": cause, "clock_mhz": 612.0}
+    return Health(t_ns=0, band=band, throttled=False, disk_free_mb=None, **known)
 
 
 def flight_messages(flight: Flight, end: int = FRAMES) -> list[Message]:
@@ -81,7 +82,10 @@ def test_beginning_and_end_of_thermal_throttle_are_warnings_with_temperature_and
         (81.0, "gpu 81 C"),
         (70.0, "all below 75 C"),
     ]
-    assert [line["covariance_mode"] for line in lines] == ["jacobian", "marginals"]
+    assert [(line["covariance_mode"], line["clock_mhz"]) for line in lines] == [
+        ("jacobian", 612.0),
+        ("marginals", 612.0),
+    ]
 
 
 def test_the_pose_of_each_match_is_logged_for_developers(tmp_path: Path) -> None:

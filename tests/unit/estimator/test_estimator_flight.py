@@ -168,16 +168,22 @@ def test_an_error_of_a_keyframe_is_in_one_step_and_not_in_each_one_from_it() -> 
     assert max(off_m[first:]) < 1.5
 
 
-def test_refined_positions_are_no_worse(long_flight: Flight, long_run: EstimatorRun) -> None:
+def test_refined_poses_are_no_worse_and_whole(long_flight: Flight, long_run: EstimatorRun) -> None:
     last = [m for m in long_run.published if isinstance(m, Refinement)][-1]
     assert sorted(p.frame_id for p in last.poses) == list(range(300))
-    refined, immediate = [], []
+    refined, immediate, turned = [], [], []
     for pose in last.poses:
         estimate = long_run.estimate(pose.frame_id)
+        assert pose.q_w_c is not None and pose.fragment_id == estimate.fragment_id >= 0
+        cov = np.reshape(pose.cov, (6, 6))
+        off_rad = log_so3(rot_from_quat(pose.q_w_c) @ long_flight.r_w_c[pose.frame_id].T)
+        turned.append(off_rad @ np.linalg.solve(cov[3:, 3:], off_rad))
+        assert (cov[0, 0], cov[0, 1]) == pytest.approx((pose.sigma_e_m**2, pose.cov_en_m2))
         immediate.append(np.linalg.norm(error_m(estimate, long_flight)[:2]))
         moved = msgspec.structs.replace(estimate, lat_deg=pose.lat_deg, lon_deg=pose.lon_deg)
         refined.append(np.linalg.norm(error_m(moved, long_flight)[:2]))
     assert np.mean(refined) <= np.mean(immediate)
+    assert 0.1 < np.mean(turned) < 6.0  # 3 is expected; neighbours share their errors
 
 
 def test_each_measurement_has_its_verdict_and_each_frame_its_estimate(long_run: EstimatorRun) -> None:

@@ -7,11 +7,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from map_matches import position_of, with_pose, with_search
+from map_matches import plane, position_of, with_pose, with_search
 from simulated_flight import FRAME_S, ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m, sigma_m, t_ns
+from terrafix.estimator.filter_state import FilterState
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import MAX_STATIC_S
+from terrafix.estimator.measurements.height import is_below_map_matching
 from terrafix.estimator.measurements.odometry import KeyframeMotion, OdometryMeasurement
+from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.motion_model import MAX_SPEED_SIGMA_MPS
 from terrafix.estimator.propagation import MOTION_TIMEOUT_S
 from terrafix.messages import MapMatch, Message, Odometry, Prediction, VehicleState, Verdict
@@ -330,6 +333,16 @@ def run_at_15_m(flight: Flight) -> EstimatorRun:
     return listener
 
 
+@pytest.mark.parametrize(("reported_m", "resets_it"), [(44.0, False), (46.0, True)])
+def test_an_estimate_too_low_is_reset_from_one_and_a_half_times_the_matching_limit(
+    reported_m: float, resets_it: bool
+) -> None:
+    state = FilterState(msgspec.structs.replace(ORIGIN, ground_amsl_m=0.0))
+    state.terrain.update(plane(0.0), np.zeros(3))
+    here = np.array([0.0, 0.0, 15.0])
+    assert is_below_map_matching(state, Attitude(0.0, 0.0, 0.0, reported_m), here) == resets_it
+
+
 def test_a_height_too_low_for_matching_is_reset_to_the_reported_one() -> None:
     flight = Flight(30, seed=3, dem=True)
     listener = run_at_15_m(flight)
@@ -347,7 +360,7 @@ def test_a_height_too_low_for_matching_is_reset_to_the_reported_one() -> None:
     ("dem", "reported_m"),
     [
         pytest.param(True, 20.0, id="reported below the matching limit"),
-        pytest.param(True, 40.0, id="reported a little above the matching limit"),
+        pytest.param(True, 44.0, id="reported a little above the matching limit"),
         pytest.param(False, None, id="without an elevation map, whatever is reported"),
     ],
 )

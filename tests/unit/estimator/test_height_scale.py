@@ -62,8 +62,7 @@ def test_the_height_scale_is_estimated_from_climbs(focal: float, dem: bool) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dem", [False, True])
-@pytest.mark.parametrize("focal", [0.8, 1.25])
+@pytest.mark.parametrize(("focal", "dem"), [(0.8, False), (1.25, True)])
 def test_a_climb_without_map_matches_ends_within_the_covariance(focal: float, dem: bool) -> None:
     nees, heights = [], []
     for seed in range(4):

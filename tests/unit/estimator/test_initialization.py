@@ -204,7 +204,7 @@ def test_after_landing_the_flight_begins_there_too() -> None:
     before, after = storyteller.flights
     assert (before.origin.start_sigma_m, after.origin.start_sigma_m) == (NOBODY_SAID_M, SIGMA_M)
     assert sorted(before.node_of) == [0, 1] and sorted(after.node_of) == [2, 3]
-    assert after.recorder.graph is storyteller.node.estimator.graph  # type: ignore[union-attr]
+    assert after.recorder.graph is storyteller.estimator.graph  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("start", [start_at(3), withdrawn(3)])

@@ -112,7 +112,7 @@ def test_of_two_matches_the_newer_one_knows_the_ground_below() -> None:
 
 
 def test_what_a_search_found_knows_its_ground_however_late_it_is() -> None:
-    flight = Flight(42, seed=9)
+    flight = Flight(43, seed=9)
     run = EstimatorRun().fly(flight, 0, 30)
     for i in range(30, 42):
         run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
@@ -120,6 +120,11 @@ def test_what_a_search_found_knows_its_ground_however_late_it_is() -> None:
     found = with_search(msgspec.structs.replace(flight.fix(36, (300.0, 200.0)), ground=plane(20.0)), relocalized=True)
     run.feed([newer, found])
     estimate = run.estimate(41)
+    assert estimate.alt_amsl_m - estimate.agl_m == pytest.approx(20.0, abs=0.5)
+    # Frame 41 stays the newest one whose match has told the ground: that of frame 38 does not.
+    run.feed([msgspec.structs.replace(flight.fix(38), verdict=Verdict.AMBIGUOUS, ground=plane(4.0))])
+    run.feed([m for m in flight.messages(42) if not isinstance(m, MapMatch)])
+    estimate = run.estimate(42)
     assert estimate.alt_amsl_m - estimate.agl_m == pytest.approx(20.0, abs=0.5)
 
 

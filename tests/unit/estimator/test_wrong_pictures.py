@@ -10,12 +10,13 @@ import pytest
 
 from inertial_flight import ORIGIN, InertialFlight
 from overloaded_flight import FRAME_EVERY, FRAME_S, sigma_m
-from overloaded_flight import Flown as LoadedFlown
+from overloaded_flight import OverloadedResult as LoadedFlown
 from simulated_flight import PLACE, EstimatorRun
 from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
 from terrafix.messages import (
     CalibrationFault,
+    Frame,
     MapMatch,
     MeasurementVerdict,
     Message,
@@ -32,7 +33,7 @@ Change = Callable[[Odometry, np.random.Generator], Odometry]
 
 
 @dataclass
-class Flown(LoadedFlown):
+class WrongPictures(LoadedFlown):
     """``published``: by the estimator. ``velocity_off_mps``: error of the velocity of each of ``estimates``.
     ``contradicted``: frames after which only a place ties images to the flight."""
 
@@ -74,13 +75,13 @@ def flown(
     matches: Callable[[int], int | None],
     frames: int = END + 16,
     first: Change | None = None,
-) -> Flown:
+) -> WrongPictures:
     """``change``: of the odometry of a frame of the fault, whose keyframe is one of them, too. ``first``: of the first
     one, whose keyframe is before the fault; None: it begins a fragment. ``matches``: the frame whose place the map
     match of a frame of the fault has; None: it has none."""
     flight, run = simulated(seed), EstimatorRun()
-    rng, result = np.random.default_rng([seed, 56]), Flown()
-    run.feed([ORIGIN])
+    rng, result = np.random.default_rng([seed, 56]), WrongPictures()
+    run.feed([ORIGIN, Frame(t_ns=0, frame_id=0, file="", width=1, height=1, buffered=True)])
     for i in range(frames):
         telemetry = [m for m in flight.messages_by_frame[i] if not isinstance(m, Odometry | MapMatch)]
         odometry, *found = images(
@@ -152,6 +153,7 @@ def test_a_frozen_picture_that_jitters_is_stalled_and_its_place_on_the_map_is_no
     assert [verdicts[i] for i in range(FIRST + 2, END)] == [Verdict.STALLED] * (END - FIRST - 2)
     predicted = {m.frame_id for m in result.published if isinstance(m, Prediction)}
     assert not predicted & set(range(FIRST + 2, END))
+    assert not [m for m in result.published if isinstance(m, CalibrationFault)]
     assert result.is_back(3.0)
 
 

@@ -9,6 +9,7 @@ from recorded_flight import blind_between, errors, replayed_graph, shifted, unma
 from simulated_flight import ORIGIN, EstimatorRun, Flight, error_m
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.messages import MapMatch, Message, SearchResult, Verdict
+from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import FlightReplayer
 from terrafix_tools.score import nees_of
@@ -63,6 +64,15 @@ def test_a_blackout_is_interpolated_from_both_sides() -> None:
     assert sigma[40] > 1.5 * max(sigma[25], sigma[60])
     assert np.mean(nees_of(errors_m, covs) < 9.21) > 0.95
     assert np.hypot(*errors_m[60:].T).max() < 8.0
+
+
+def test_further_rounds_of_linearisation_do_not_move_the_track(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = replayed_graph(Flight(24, seed=4), blind_between(8, 16))
+    tracks = []
+    for more in (0, 2):
+        monkeypatch.setattr(batch_smoother, "ROUNDS", batch_smoother.ROUNDS + more)
+        tracks.append(np.array([pose.translation() for pose in smooth(graph).poses]))
+    assert np.abs(tracks[1] - tracks[0]).max() < 0.01
 
 
 @pytest.mark.slow

@@ -1,14 +1,17 @@
 """Clocks, rails, fans and power mode from a sysfs tree as on a Jetson Orin, and from files that cannot be read."""
 
+import io
+import json
 from pathlib import Path
 
 import pytest
 
+from terrafix.core import logs
 from terrafix.core.config import Config, HealthSection
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.health.node import HealthNode, make_edge
-from terrafix.health.power import clock_limit, read_clocks, read_fans, read_power_mode, read_rails, whole_computer_w
+from terrafix.health.power import most_limited, read_clocks, read_fans, read_power_mode, read_rails, whole_computer_w
 from terrafix.messages import Fan, Health, PowerRail, ProcessorClock, ThermalReading
 
 
@@ -50,8 +53,8 @@ def test_clocks_have_the_present_limit_and_the_highest_of_the_hardware(tmp_path:
         ProcessorClock(name="policy4", mhz=1510.4, limit_mhz=2201.6, max_mhz=2201.6),
         ProcessorClock(name="17000000.gpu", mhz=306.0, limit_mhz=612.0, max_mhz=918.0),
     ]
-    assert clock_limit(clocks) == pytest.approx(612 / 918)
-    assert clock_limit([]) is None
+    assert most_limited(clocks) == clocks[2]
+    assert most_limited([]) is None
 
 
 def test_a_clock_without_a_limit_may_reach_the_highest(tmp_path: Path) -> None:
@@ -115,4 +118,24 @@ def test_health_states_power_and_clock_limit_of_the_reading(tmp_path: Path) -> N
     assert (len(reading.clocks), len(reading.rails), len(reading.fans)) == (3, 3, 1)
     (health,) = HealthNode(config.health).on(reading)
     assert isinstance(health, Health)
-    assert (health.power_w, health.clock_limit) == (pytest.approx(7.56), pytest.approx(612 / 918))
+    assert (health.power_w, health.clock_limit, health.clock_mhz) == (
+        pytest.approx(7.56),
+        pytest.approx(612 / 918),
+        612.0,
+    )
+
+
+def test_the_line_of_a_thermal_band_has_power_and_clock(tmp_path: Path) -> None:
+    orin(tmp_path)
+    config = Config(health=HealthSection(sysfs_root=str(tmp_path)))
+    edge = make_edge(NodeContext(config=config, frames=MemoryFrameStore(1), map_path=None, out_dir=tmp_path))
+    (reading,) = edge.poll(0)
+    assert isinstance(reading, ThermalReading)
+    (health,) = HealthNode(config.health).on(reading)
+    writer = logs.configure("INFO", "health", stream := io.StringIO())
+    edge.on_message(health)
+    edge.on_message(health)  # the same band
+    writer.close()
+    (line,) = [json.loads(line) for line in stream.getvalue().splitlines()]
+    assert (line["event"], line["band"], line["clock_mhz"]) == ("thermal band", "normal", 612.0)
+    assert (line["power_w"], line["clock_limit"]) == (pytest.approx(7.56, abs=0.01), pytest.approx(0.667, abs=0.001))

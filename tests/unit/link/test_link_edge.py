@@ -145,9 +145,22 @@ def test_streams_are_requested_and_requested_again_when_they_stop(station: Speak
         station.send(heartbeat(), *(attitude(second * 1000 + i * 40) for i in range(25)))
         published = polled(edge, second * S)
     requested_again = {int(a.param1) for a in station.received("COMMAND_LONG")}
-    assert requested_again == {int(a.param1) for a in requested} - {30, 295}  # AIRSPEED is optional
+    assert requested_again == {int(a.param1) for a in requested} - {30, 285, 295}  # optional: AIRSPEED, a gimbal
     assert "GLOBAL_POSITION_INT 0.0 of 5 Hz, SYSTEM_TIME 0.0 of 1 Hz" in status(published).detail
     assert "ATTITUDE" not in status(published).detail
+
+
+def test_the_gimbal_of_the_served_vehicle_is_read_behind_its_autopilot(station: Speaker, edge: MavlinkEdge) -> None:
+    connect(station, edge)
+    down = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)  # pitch -90
+    flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+    report = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, 5, flags, list(down), 0, 0, 0, 0)
+    gimbal, other = (mavlink.MAVLink(None, srcSystem=system, srcComponent=154) for system in (7, 8))
+    for sender in (gimbal, other):
+        station.socket.sendto(bytes(report.pack(sender)), station.peer)
+    (found,) = (x for x in polled(edge, 1 * S) if isinstance(x, m.GimbalAttitude))
+    assert (found.t_ns, found.device, found.from_north) == (1 * S, 154, False)
+    assert found.q == pytest.approx(down)
 
 
 def test_vehicle_state_contains_attitude_and_recent_relative_height(station: Speaker, edge: MavlinkEdge) -> None:

@@ -327,22 +327,42 @@ def armed(t_ns: int, yes: bool | None) -> m.VehicleState:
     return m.VehicleState(t_ns=t_ns, source="mavlink", armed=yes)
 
 
-@pytest.mark.parametrize(
-    ("first_seen", "fix_type"),
-    [(True, 1), (False, 3), (None, 3)],
-    ids=["in flight", "on the ground", "no autopilot"],
+GNSS_START = m.InitialPosition(
+    t_ns=1, verdict=m.Verdict.ACCEPTED, lat_deg=LAT, lon_deg=LON, sigma_m=2.0, ground_amsl_m=None
 )
-def test_a_vehicle_first_seen_armed_has_no_fix_before_the_first_map_fix(first_seen: bool | None, fix_type: int) -> None:
-    """After a restart in flight the estimate is at the start coordinate, with a small claimed covariance."""
-    node = LinkNode(10.0)
+
+
+@pytest.mark.parametrize(
+    ("first_seen", "ground_fix", "received", "fix_type"),
+    [
+        (True, False, None, 1),
+        (True, True, None, 1),
+        (False, False, None, 1),
+        (False, True, None, 3),
+        (False, False, GNSS_START, 3),
+        (False, False, msgspec.structs.replace(GNSS_START, verdict=m.Verdict.OUTSIDE_MAP), 1),
+        (None, False, None, 3),
+    ],
+    ids=["in flight", "in flight, by mistake", "disarmed", "on the ground", "measured", "elsewhere", "no autopilot"],
+)
+def test_a_start_is_a_fix_before_the_map_if_it_was_measured_to_stand_or_stated_to(
+    first_seen: bool | None, ground_fix: bool, received: m.InitialPosition | None, fix_type: int
+) -> None:
+    """After a restart in flight the estimate is at the start coordinate, with a small claimed covariance; disarmed, the
+    vehicle may stand on a deck."""
+    node = LinkNode(10.0, ground_fix=ground_fix)
     list(node.on(armed(0, first_seen)))
-    if first_seen is False:
-        list(node.on(armed(1, True)))  # takes off
+    if received is not None:
+        list(node.on(received))
     unproved = fly(node, 0, 5 * S, every(500 * MS, lambda t: estimate(t, anchor_age_ms=-1)))
     assert {g.fix_type for g in gps_since(unproved, S)} == {fix_type}
-    assert (texts(unproved).count("Terrafix: started in flight, searching the map") == 1) == (fix_type == 1)
-    found = fly(node, 5 * S, 8 * S, every(500 * MS, lambda t: estimate(t, anchor_age_ms=200)))
-    assert {g.fix_type for g in gps_since(found, 6 * S)} == {3}
+    if first_seen is False:
+        list(node.on(armed(5 * S, True)))  # takes off
+    assert texts(unproved).count("Terrafix: started in flight, searching the map") == (first_seen is True)
+    unproved = fly(node, 5 * S, 10 * S, every(500 * MS, lambda t: estimate(t, anchor_age_ms=-1)))
+    assert {g.fix_type for g in gps_since(unproved, 6 * S)} == {fix_type}
+    found = fly(node, 10 * S, 13 * S, every(500 * MS, lambda t: estimate(t, anchor_age_ms=200)))
+    assert {g.fix_type for g in gps_since(found, 11 * S)} == {3}
 
 
 def test_texts_about_a_flapping_fix_are_debounced() -> None:

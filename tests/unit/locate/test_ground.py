@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 import pointed_flight as rig
+from flight_records import write_record
 from terrafix import messages as m
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import SourceError
+from terrafix_tools.finalise.point_cloud import POINTS, VERTEX, write_ply
+from terrafix_tools.finalised import write
 from terrafix_tools.locate.cloud import PointCloud, build_cloud
 from terrafix_tools.locate.ground import GroundPatch, Surface, ground_patch
+from terrafix_tools.locate.locator import FlightLocator
 from terrafix_tools.locate.views import CameraView, read_views
 
 EMPTY = PointCloud(np.zeros((0, 3)), np.zeros(0))
@@ -157,3 +161,21 @@ def test_cloud_has_the_level_of_the_elevation(tmp_path: Path) -> None:
 def test_cloud_of_another_fragment_is_empty(tmp_path: Path) -> None:
     flight = read_views(rig.write_flight(tmp_path / "flight.mcap"))
     assert len(build_cloud(flight, 1, None).points_m) == 0
+
+
+def test_the_points_of_a_finalised_flight_are_used_whatever_their_fragment(tmp_path: Path) -> None:
+    grid = np.arange(-100.0, 180.0, 4.0)
+    e_m, n_m = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    points = np.zeros(len(e_m), VERTEX)
+    points["x"], points["y"], points["z"], points["sigma"] = e_m, n_m, rig.ground_m(e_m, n_m), 0.1
+    points["fragment"] = 7
+    write_ply(tmp_path / POINTS, points, rig.ORIGIN)
+    write_record(tmp_path / "flight.mcap", [x for x in rig.messages() if not getattr(x, "three_view", None)])
+    roof = ("3", rig.pixel(3, np.array([rig.HOUSE_E_M, 0.0, rig.START_AMSL_M + rig.HOUSE_M])))
+    assert FlightLocator.open(tmp_path).locate([roof]).surface is Surface.PLANE
+    write(tmp_path, [], {"flights": [{"solution": "refined"}]})
+    found = FlightLocator.open(tmp_path).locate([roof])
+    assert found.surface is Surface.POINTS and found.p_m[2] == pytest.approx(512.0, abs=0.2)
+    (tmp_path / POINTS).write_bytes(b"ply")
+    with pytest.raises(SourceError, match=r"points\.ply: cannot be read"):
+        FlightLocator.open(tmp_path)

@@ -11,6 +11,8 @@ import pointed_flight as rig
 from flight_records import ORIGIN, write_record
 from terrafix.core.errors import MapError, SourceError, UsageError
 from terrafix_tools.cli import app
+from terrafix_tools.console.compute.locating import Locators
+from terrafix_tools.console.locating import Question
 from terrafix_tools.locate.locator import FlightLocator
 
 ROOF_M = np.array([rig.HOUSE_E_M + 4.0, -6.0, rig.START_AMSL_M + rig.HOUSE_M])
@@ -109,3 +111,15 @@ def test_wrong_arguments_are_named(record: Path, arguments: list[str], error: ty
 def test_file_that_is_no_record_is_refused(tmp_path: Path) -> None:
     (tmp_path / "flight.mcap").write_bytes(b"")
     assert isinstance(call(tmp_path, "--frame", "0", "--pixel", "1,1").exception, SourceError)
+
+
+def test_the_console_combines_the_pixels_of_several_frames(record: Path) -> None:
+    mast_m = np.array([30.0, 12.0, rig.START_AMSL_M + 20.0])  # above all points of the cloud
+    seen = [(i, rig.pixel(i, mast_m)) for i in (1, 2, 3)]
+    locators = Locators()
+    one, three = (locators.answer(Question(str(record.parent), "", pixels)) for pixels in (seen[:1], seen))
+    assert not three.refused and three.consistent
+    off_m = [np.hypot(*(ORIGIN.to_local(found.lat_deg, found.lon_deg) - mast_m[:2])) for found in (one, three)]
+    assert off_m[1] < 0.9 * off_m[0]
+    other = locators.answer(Question(str(record.parent), "", [seen[0], (2, rig.pixel(2, FIELD_M))]))
+    assert not other.consistent

@@ -12,8 +12,12 @@ import pointed_flight as rig
 from flight_records import write_record
 from terrafix import messages as m
 from terrafix.core.errors import SourceError, UsageError
+from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.filter_state import focal_scale
+from terrafix_tools.before_after import FINALISED, REFINED
+from terrafix_tools.estimates import numbers
+from terrafix_tools.finalised import FinalRow, write
 from terrafix_tools.locate.views import CameraView, FlightViews, read_views
 
 
@@ -120,3 +124,47 @@ def test_ground_plane_of_the_map_match_is_with_its_frame(tmp_path: Path) -> None
     match = m.MapMatch(t_ns=0, frame_id=0, verdict=m.Verdict.ACCEPTED, matcher="gradient", ground=ground)
     assert view_of(tmp_path, match).ground == ground
     assert replace(view_of(tmp_path, match), ground=None).ground is None
+
+
+def refined(east_m: float, up_m: float | None, source: m.RefinementSource) -> m.Refinement:
+    """Of frame 0, turned by 0.02 rad, with covariances that no estimate has."""
+    lat_deg, lon_deg = rig.ORIGIN.to_wgs84(east_m, 0.0)
+    turned = rig.r_w_c() @ exp_so3(np.array([0.0, 0.0, 0.02]))
+    pose = m.RefinedPose(
+        frame_id=0,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_amsl_m=up_m,
+        sigma_e_m=2.0,
+        sigma_n_m=2.0,
+        q_w_c=quat_from_rot(turned),
+        cov=tuple((4.0 * np.eye(6)).ravel().tolist()),
+    )
+    return m.Refinement(t_ns=9, poses=[pose], source=source)
+
+
+def test_the_newest_refined_pose_of_a_frame_counts_with_its_orientation_and_covariance(tmp_path: Path) -> None:
+    first, last = refined(7.0, 601.0, m.RefinementSource.SMOOTHER), refined(3.0, 603.0, m.RefinementSource.FLIGHT)
+    view = view_of(tmp_path, rig.calibration(0), first, last)
+    assert view.p_c_in_w_m == pytest.approx([3.0, 0.0, 603.0], abs=1e-5)
+    assert view.r_w_c == pytest.approx(rig.r_w_c() @ exp_so3(np.array([0.0, 0.0, 0.02])), abs=1e-9)
+    assert view.cov == pytest.approx(4.0 * np.eye(6)) and view.ground_m == pytest.approx(500.0)
+    without_height = view_of(tmp_path, rig.calibration(0), refined(3.0, None, m.RefinementSource.FLIGHT))
+    assert without_height.p_c_in_w_m[2] == pytest.approx(600.0)
+
+
+@pytest.mark.parametrize(("solution", "focal"), [(FINALISED, 1.1), (REFINED, 1.0)])
+def test_a_finalised_pose_comes_before_a_refined_one_with_the_lens_of_its_solution(
+    tmp_path: Path, solution: str, focal: float
+) -> None:
+    lat_deg, lon_deg = rig.ORIGIN.to_wgs84(0.0, 5.0)
+    row = FinalRow("0000.jpg", 0.0, lat_deg, lon_deg, 610.0, fragment_id=0, m_per_unit=1.5)
+    row.q_w_c, row.cov = numbers(quat_from_rot(rig.r_w_c())), numbers((9.0 * np.eye(6)).ravel().tolist())
+    changes = [("focal length", 1.1 * rig.CAMERA.fx), ("radial coefficient", -0.2)]
+    flight = {"solution": solution, "before_after": [{"what": what, "after": after} for what, after in changes]}
+    write(tmp_path, [row], {"flights": [flight]})
+    view = view_of(tmp_path, rig.calibration(0), refined(3.0, 603.0, m.RefinementSource.FLIGHT))
+    assert view.p_c_in_w_m == pytest.approx([0.0, 5.0, 610.0], abs=1e-2)
+    assert np.diag(view.cov) == pytest.approx([9.0] * 6)
+    assert view.calibration.fx == pytest.approx(focal * rig.CAMERA.fx)
+    assert view.calibration.radial_k1 == (-0.2 if solution == FINALISED else 0.0)

@@ -210,7 +210,7 @@ def test_an_invalid_area_file_is_rejected_with_the_reason(tmp_path: Path, name: 
         ("10.0,83.9,10.1,83.95", 20.0, "degrees of latitude"),
         ("10.0,-85,10.1,-84.9", 0.0, "degrees of latitude"),
         ("179.9,10,179.95,10.1", 20.0, "antimeridian"),
-        ("10.0,40.0,12.0,42.0", 0.0, "at most 10,000"),
+        ("10.0,40.0,12.0,42.0", 0.0, "at most 20,000"),
         ("13.0,47.0,13.1,47.1", -1.0, "between 0 and 200"),
         ("13.0,47.0,13.1,47.1", math.nan, "between 0 and 200"),
         ("nowhere.kml", 1.0, "no such file"),
@@ -219,6 +219,10 @@ def test_an_invalid_area_file_is_rejected_with_the_reason(tmp_path: Path, name: 
 def test_invalid_boxes_and_buffers_are_rejected(text: str, buffer_km: float, reason: str) -> None:
     with pytest.raises(UsageError, match=reason):
         check_area(read_area(text, buffer_km=buffer_km))
+
+
+def test_20_km_around_a_route_of_300_km_are_one_area() -> None:
+    assert 13_000.0 < check_area(read_area("10.0,47.0,13.95,47.001", buffer_km=20.0)) < 14_000.0
 
 
 def test_a_corridor_needs_a_line_and_a_width(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ def written(out: Path) -> int:
     return sum(part.stat().st_size for part in out.parent.glob(f".{out.name}.*/part.gpkg"))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_cluster_build_is_byte_identical_also_when_a_worker_is_killed(tmp_path: Path) -> None:
     """End to end: the real scheduler, three real workers, the command line; then the scheduler dies."""

@@ -16,18 +16,17 @@ from terrafix import messages as m
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Config
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix.core.geodesy import local_crs, quat_from_rot
-from terrafix.core.pose import exp_so3
+from terrafix.core.geodesy import local_crs
 from terrafix.map.package import MapPackage
 from terrafix.recorder.provenance import header
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.locate.locator import FlightLocator
-from terrafix_tools.locate.views import CameraView, read_views
+from terrafix_tools.locate.views import CameraView
 from terrafix_tools.mapping.area.build import with_statement
-from terrafix_tools.mapping.orthomosaic.composite import Composite, Grid, grid_around
-from terrafix_tools.mapping.orthomosaic.frames import refined_views, spread
-from terrafix_tools.mapping.orthomosaic.make import Request, make
+from terrafix_tools.mapping.orthomosaic.composite import Composite, OrthomosaicGrid, grid_around
+from terrafix_tools.mapping.orthomosaic.frames import spread
+from terrafix_tools.mapping.orthomosaic.make import OrthomosaicRequest, make
 from terrafix_tools.mapping.orthomosaic.write import read_statement
 from terrafix_tools.mapping.sources.spec import SourceSpec
 
@@ -71,7 +70,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def mosaic(flight: Path) -> Path:
     with rasterio.Env(GDAL_CACHEMAX=100_000):  # bytes: GDAL writes at once what it would keep of a large file
-        make(Request(flight, flight / "mosaic.tif", gsd_m=0.5, flown_by="crew 7"))
+        make(OrthomosaicRequest(flight, flight / "mosaic.tif", gsd_m=0.5, flown_by="crew 7"))
     return flight / "mosaic.tif"
 
 
@@ -119,7 +118,7 @@ def test_accuracy_is_that_of_located_pixels(mosaic: Path, flight: Path) -> None:
 
 
 def test_steepest_frame_is_shown() -> None:
-    grid = Grid(local_crs(48.0, 11.0), -100.0, 20.0, 1.0, 300, 40)
+    grid = OrthomosaicGrid(local_crs(48.0, 11.0), -100.0, 20.0, 1.0, 300, 40)
     made = Composite(grid, ORIGIN, None)
     views = {i: view_of(i) for i in range(FRAMES)}
     for i in (2, 0, 3, 1):
@@ -131,7 +130,7 @@ def test_steepest_frame_is_shown() -> None:
 
 def test_relief_moves_what_a_frame_shows_to_its_place() -> None:
     """A plateau 20 m high fills the view: the same pixels are seen on ground that is nearer."""
-    grid = Grid(local_crs(48.0, 11.0), -40.0, 40.0, 1.0, 80, 80)
+    grid = OrthomosaicGrid(local_crs(48.0, 11.0), -40.0, 40.0, 1.0, 80, 80)
     made = Composite(grid, ORIGIN, lambda e_m, _n_m: np.full(e_m.shape, rig.START_AMSL_M + 20.0))
     made.add(view_of(0), image(0))
     east_m, north_m = np.array([24.5]), np.array([-15.5])  # a fifth nearer: 1.25 times as far on the level ground
@@ -140,7 +139,7 @@ def test_relief_moves_what_a_frame_shows_to_its_place() -> None:
 
 
 def test_frame_outside_the_raster_draws_nothing() -> None:
-    made = Composite(Grid(local_crs(48.0, 11.0), 5000.0, 6000.0, 1.0, 50, 50), ORIGIN, None)
+    made = Composite(OrthomosaicGrid(local_crs(48.0, 11.0), 5000.0, 6000.0, 1.0, 50, 50), ORIGIN, None)
     made.add(view_of(0), image(0))
     assert not made.valid.any()
 
@@ -164,35 +163,6 @@ def test_frames_with_uncertain_positions_and_near_ones_are_left_out() -> None:
     assert [view.frame_id for view in spread(views, 10.0)] == [0, 2]
     hovering = {i: view_of(0) for i in range(3)} | {3: view_of(1)}
     assert [view.p_c_in_w_m[0] for view in spread(hovering, 10.0)] == [0.0, 20.0]
-
-
-def test_refined_positions_and_their_sigmas_are_used(tmp_path: Path) -> None:
-    lat_deg, lon_deg = ORIGIN.to_wgs84(41.0, -2.0)
-    pose = m.RefinedPose(frame_id=2, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=600.0, sigma_e_m=0.25, sigma_n_m=4.0)
-    other = m.RefinedPose(frame_id=99, lat_deg=0.0, lon_deg=0.0, alt_amsl_m=0.0, sigma_e_m=1.0, sigma_n_m=1.0)
-    write_flight(tmp_path, m.Refinement(t_ns=9 * PERIOD_NS, poses=[pose, other]), images=False)
-    locator = FlightLocator(read_views(tmp_path), None)
-    views = refined_views(locator, tmp_path)
-    assert views[2].p_c_in_w_m == pytest.approx([41.0, -2.0, 600.0], abs=1e-6)
-    # East is known better than in flight, north not: 1 m in flight, 4 m refined.
-    assert np.diag(views[2].cov)[:3] == pytest.approx([0.25**2, 1.0, 1.0])
-    assert views[1] is locator.flight.views[1]
-
-
-def test_a_refined_orientation_is_used_and_the_newest_refinement_of_a_frame_counts(tmp_path: Path) -> None:
-    lat_deg, lon_deg = ORIGIN.to_wgs84(41.0, -2.0)
-    turned = rig.r_w_c() @ exp_so3(np.array([0.0, 0.0, 0.02]))
-    old = m.RefinedPose(frame_id=2, lat_deg=0.0, lon_deg=0.0, alt_amsl_m=600.0, sigma_e_m=0.1, sigma_n_m=0.1)
-    pose = m.RefinedPose(
-        frame_id=2, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=600.0, sigma_e_m=0.25, sigma_n_m=4.0,
-        q_w_c=quat_from_rot(turned), rotation_sigma_rad=(1.0, 1e-6, 1.0))  # fmt: skip
-    refinements = [m.Refinement(t_ns=9 * PERIOD_NS, poses=[p], source=m.RefinementSource.SMOOTHER) for p in (old, pose)]
-    write_flight(tmp_path, *refinements, images=False)
-    locator = FlightLocator(read_views(tmp_path), None)
-    view, before = refined_views(locator, tmp_path)[2], locator.flight.views[2]
-    assert view.p_c_in_w_m[:2] == pytest.approx([41.0, -2.0], abs=1e-6)
-    assert np.allclose(view.r_w_c, turned, atol=1e-9)
-    assert np.diag(view.cov)[4] == pytest.approx(1e-12) and np.diag(view.cov)[3] == np.diag(before.cov)[3]
 
 
 def test_default_pixel_is_that_of_the_frames_and_the_raster_holds_all_of_them() -> None:
@@ -255,10 +225,10 @@ def test_frames_of_the_source_are_taken_where_the_record_has_none(tmp_path: Path
     run.mkdir()
     write_flight(run, images=False)
     with pytest.raises(SourceError, match="names no source; give its flight with --frames"):
-        make(Request(run, tmp_path / "m.tif"))
-    given = make(Request(run, tmp_path / "a.tif", frames=source, gsd_m=1.0))
+        make(OrthomosaicRequest(run, tmp_path / "m.tif"))
+    given = make(OrthomosaicRequest(run, tmp_path / "a.tif", frames=source, gsd_m=1.0))
     (run / "summary.json").write_text(json.dumps({"source": str(source)}))
-    named = make(Request(run, tmp_path / "b.tif", gsd_m=1.0))
+    named = make(OrthomosaicRequest(run, tmp_path / "b.tif", gsd_m=1.0))
     assert given.frames == named.frames == FRAMES and given.statement.date == ""
 
 
@@ -276,4 +246,4 @@ def test_wrong_requests_are_named(
 ) -> None:
     options: dict[str, object] = {"out": tmp_path / "m.tif", **changed}
     with pytest.raises(error, match=words):
-        make(Request(flight, **options))  # type: ignore[arg-type]
+        make(OrthomosaicRequest(flight, **options))  # type: ignore[arg-type]

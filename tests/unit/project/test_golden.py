@@ -9,7 +9,7 @@ from link_rig import S, estimate
 from terrafix.core.errors import UsageError
 from terrafix.messages import Frame, Message
 from terrafix_lab.golden import __main__ as golden
-from terrafix_lab.golden.cases import CASES, Case
+from terrafix_lab.golden.cases import CASES, GoldenCase
 from terrafix_lab.golden.digest import Digest, Digests, differences
 
 FRAMES: list[Message] = [Frame(t_ns=i * S, frame_id=i, file=f"{i}.jpg", width=8, height=4) for i in range(3)]
@@ -82,7 +82,7 @@ def test_missing_and_corrupt_reference_files_are_errors(tmp_path: Path) -> None:
 
 
 def test_cases_are_compared_with_their_references(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    case = Case("flight", lambda _, __: {})
+    case = GoldenCase("flight", lambda _, __: {})
     monkeypatch.setattr(golden, "run_case", lambda *_: digests(FRAMES))
     golden.write(tmp_path / "refs.json", {"flight": digests(FRAMES)})
     assert golden.compare([case], tmp_path, golden.references(tmp_path / "refs.json")) == 0

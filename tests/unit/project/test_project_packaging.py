@@ -33,6 +33,7 @@ IMPORTED_AS = {
     "pyserial": "serial",
     "pyzmq": "zmq",
     "pillow": "PIL",
+    "pyyaml": "yaml",
     "python-multipart": "python_multipart",
     "faiss-cpu": "faiss",
     "systemd-python": "systemd",
@@ -42,6 +43,7 @@ COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # us
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 SEARCH = ROOT / "daemon" / "terrafix" / "anchor" / "place_index" / "faiss_ivf.py"  # the only file that imports FAISS
 SERVICE = ROOT / "daemon" / "terrafix" / "runtime" / "systemd.py"  # the only file that imports systemd-python
+ULOG = ROOT / "daemon" / "terrafix" / "core" / "autopilot_log" / "ulog.py"  # the only file that imports pyulog
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools", "terrafix_lab"}
 SOURCES = ("daemon", "engines", "tools")
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
@@ -49,12 +51,12 @@ LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 def imported(*folders: str, extras: bool = True) -> set[str]:
     """Top-level names of all third-party modules imported below the folders; with or without the code of the extras of
-    what flies: FAISS and systemd."""
+    what flies: FAISS, systemd and pyulog."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
         for path in (ROOT / folder).rglob("*.py"):
-            if not extras and path in (SEARCH, SERVICE):
+            if not extras and path in (SEARCH, SERVICE, ULOG):
                 continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Import):
@@ -147,6 +149,7 @@ def test_the_version_is_the_same_in_code_metadata_and_changelog() -> None:
     assert metadata.version("terrafix") == version
     newest = re.search(r"^## \[([^\]]+)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.M)
     assert newest is not None and newest[1] == version
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_the_licence_file_matches_the_declared_licence() -> None:
@@ -229,7 +232,7 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
     assert not (unpacked / "terrafix_engines" / "train").exists()
     shown = in_wheel(unpacked, "--help")
     commands = [line.split()[1] for line in shown.stdout.splitlines() if re.match(r"│ [a-z]", line)]
-    at_it = "run replay evaluate report preflight status hint log source files models map"
+    at_it = "run status hint preflight camera source files models replay report evaluate log map"
     assert commands == at_it.split(), shown.stderr
     status = in_wheel(unpacked, "status", "--run", "nowhere")
     assert status.returncode == 2 and status.stderr.startswith("terrafix: nowhere: no such folder; omit --run")

@@ -27,6 +27,7 @@ from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images, read_thumbnails
 from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 from terrafix.recorder.segments import MEGABYTE, SegmentRing
+from terrafix.recorder.writer import FlightWriter
 
 pytestmark = pytest.mark.real_time
 
@@ -60,6 +61,17 @@ def edge_on(folder: Path, store: MemoryFrameStore | None = None, **recorder: Any
 
 def read(path: Path, result: ReadResult | None = None) -> list[m.Message]:
     return [message for _, _, message in read_flight(path, result)]
+
+
+def test_without_a_flush_no_more_than_128_kb_are_missing_after_a_kill(tmp_path: Path) -> None:
+    """As the outputs state it; mcap keeps the open chunk in memory."""
+    writer = FlightWriter(tmp_path / "flight.mcap", {})
+    for i in range(40):
+        writer.write(m.LogLine(t_ns=i, process="link", level="info", event=os.urandom(4096).hex()), i)
+    on_disk = tmp_path / "killed.mcap"
+    on_disk.write_bytes((tmp_path / "flight.mcap").read_bytes())
+    assert len(read(on_disk)) >= 40 - 18  # 16 fill a chunk; a part of the one before is in the buffer of the file
+    writer.close()
 
 
 def test_recorded_messages_are_read_back(tmp_path: Path) -> None:

@@ -86,6 +86,43 @@ def test_a_node_outside_the_process_table_is_an_error() -> None:
         InProcessShell({"foo": ReplyingNode("foo")}, lambda *_: None, table=TABLE)
 
 
+class CountingEdge:
+    """Reads one Frame at each poll, and keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.given: list[str] = []
+
+    def poll(self, now_ns: int) -> Iterable[m.Message]:
+        yield frame(now_ns)
+
+    def on_message(self, message: m.Message) -> None:
+        self.given.append(type(message).__name__)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def test_in_lockstep_an_edge_feeds_its_own_node_and_gets_what_that_receives_and_publishes() -> None:
+    sunk: list[tuple[str, str]] = []
+    nodes, edge = {name: ReplyingNode(name) for name in ("first", "listener")}, CountingEdge()
+    table = (Process("first", "", (m.Origin,), (m.MeasurementVerdict,), 10.0, 1.0), TABLE[2])
+    shell = InProcessShell(
+        nodes, lambda who, message: sunk.append((who, type(message).__name__)), edges={"first": edge}, table=table
+    )
+    shell.feed(ORIGIN)
+    shell.step(0)
+    read, answered, ticked = (SOURCE, "Frame"), ("first", "MeasurementVerdict"), ("first", "LinkStatus")
+    assert sunk == [(SOURCE, "Origin"), read, ("listener", "MeasurementVerdict"), answered, ticked]
+    assert nodes["first"].received == ["Origin", "Frame"], "what its edge has read, though it does not subscribe to it"
+    assert nodes["listener"].received == ["Origin", "Frame", "MeasurementVerdict", "LinkStatus"]
+    assert edge.given == ["Origin", "MeasurementVerdict", "LinkStatus"], "not what it has read itself"
+
+
+def test_an_edge_without_its_node_is_an_error() -> None:
+    with pytest.raises(ValueError, match="not in the process table: first"):
+        InProcessShell({}, lambda *_: None, edges={"first": CountingEdge()}, table=TABLE)
+
+
 def test_the_recorder_subscribes_to_every_message_type() -> None:
     recorded = set(next(p for p in PROCESSES if p.name == "recorder").subscribes)
     assert recorded == set(m.AnyMessage.__args__)

@@ -40,7 +40,7 @@ def children_find_the_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", f"{RIGS}{os.pathsep}{existing}" if existing else str(RIGS))
 
 
-class Flight:
+class SupervisedRun:
     """A supervised run of the test table in a thread of this process."""
 
     def __init__(
@@ -99,8 +99,8 @@ class Flight:
 
 
 @contextmanager
-def flight(folder: Path, frames: int = FOREVER, **options: object) -> Iterator[Flight]:
-    running = Flight(folder, frames, **options)  # type: ignore[arg-type]
+def flight(folder: Path, frames: int = FOREVER, **options: object) -> Iterator[SupervisedRun]:
+    running = SupervisedRun(folder, frames, **options)  # type: ignore[arg-type]
     try:
         yield running
     finally:
@@ -422,7 +422,7 @@ def test_all_processes_keep_to_the_cores_of_the_budget(tmp_path: Path) -> None:
         eventually(lambda: all(os.sched_getaffinity(f.pid(process.name)) == {first} for process in TABLE), within_s=10)
 
 
-def priorities(f: Flight, own: int) -> dict[str, int]:
+def priorities(f: SupervisedRun, own: int) -> dict[str, int]:
     return {p.name: os.getpriority(os.PRIO_PROCESS, f.pid(p.name)) - own for p in TABLE}
 
 

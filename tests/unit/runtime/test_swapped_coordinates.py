@@ -9,7 +9,7 @@ from terrafix.core.config import Config
 from terrafix.map.package import MapPackage
 from terrafix_tools.live import swapped_hint
 from terrafix_tools.preflight import computer
-from terrafix_tools.preflight.lines import Status
+from terrafix_tools.preflight.lines import CheckStatus
 
 
 class OnePlace:
@@ -38,4 +38,4 @@ def test_preflight_reports_a_swapped_start(start: str, todo: str) -> None:
     config = Config()
     config = msgspec.structs.replace(config, source=msgspec.structs.replace(config.source, start=start))
     (line,) = computer._start(PLACE, config)
-    assert line.status is Status.FAIL and todo in line.fix
+    assert line.status is CheckStatus.FAIL and todo in line.fix

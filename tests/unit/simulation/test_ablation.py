@@ -10,12 +10,13 @@ from terrafix_lab.ablation.__main__ import SHIM, main
 from terrafix_lab.ablation.mechanisms import MECHANISMS, VARIABLE
 
 PROBE = """
-from terrafix.estimator.integrity.map_consistency import MapConsistency
+from terrafix.core.agreement import Agreement
+from terrafix.estimator.integrity.other_ground import OtherGround
 import numpy as np
-found = MapConsistency()
+found = OtherGround(Agreement())
 for _ in range(20):
-    found.add_rejected(np.array([300.0, 0.0]))
-print(found.probability > 0.5)
+    found.on_rejected(np.array([300.0, 0.0]))
+print(found.variance_m2 > 0.0)
 """
 
 

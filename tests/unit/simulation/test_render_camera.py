@@ -12,7 +12,7 @@ from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix_lab.sim.camera.lens import Fisheye
-from terrafix_lab.sim.camera.mount import Fixed, Gimbal, Motion
+from terrafix_lab.sim.camera.mount import CameraMotion, Fixed, Gimbal
 from terrafix_lab.sim.camera.render import Film, Renderer
 from terrafix_lab.sim.camera.weather import Weather
 from terrafix_lab.sim.ground.draped_image import Ground, drape
@@ -109,7 +109,7 @@ def test_a_rolling_shutter_renders_each_row_at_its_time() -> None:
     film = Film(noise=0.0, vignette=0.0, blur_px=0.0, exposure_jitter=0.0, detail=0.0, readout_s=readout_s)
     velocity, rates = np.array([14.0, 20.0, -1.0]), np.array([0.3, -0.2, 0.6])
     p_c, r_w_c = np.array([0.0, 0.0, 320.0]), DOWN @ cv2.Rodrigues(np.array([0.05, 0.1, 0.4]))[0]
-    frame = Renderer(ground, CAMERA, film=film).frame(p_c, r_w_c, 0, motion=Motion(velocity, rates))[..., 0]
+    frame = Renderer(ground, CAMERA, film=film).frame(p_c, r_w_c, 0, motion=CameraMotion(velocity, rates))[..., 0]
     errors, still = [], []
     for point in np.column_stack([places, hills(places[:, 0], places[:, 1])]):
         row = 269.5

@@ -124,6 +124,7 @@ print(int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_hundred_square_kilometres_are_not_held_in_memory() -> None:
     """The image alone would be 1200 MB; the flight crosses all of it."""

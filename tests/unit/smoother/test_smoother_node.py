@@ -1,15 +1,20 @@
 """The smoother: refined poses of all fragments, bounded in rate and size."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from refined_track import ANCHOR_COV, Track
 from simulated_flight import ORIGIN
+from terrafix.core.config import Config, SmootherSection
+from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import rot_from_quat
+from terrafix.core.node import NodeContext
 from terrafix.core.pose import log_so3
 from terrafix.messages import RefinementSource
 from terrafix.smoother.keyframe_graph import KeyframeGraph
-from terrafix.smoother.node import MAX_POSES, SmootherNode
+from terrafix.smoother.node import MAX_POSES, SmootherNode, make_node
 
 LAP = 80  # frames
 
@@ -30,7 +35,31 @@ def test_map_matches_at_both_ends_correct_position_and_orientation_of_all_betwee
     track.fly(LAP, LAP + 3)
     assert max(track.error_m(i) for i in range(LAP)) < 4.5
     assert max(turned_rad(track, i) for i in range(LAP)) < 0.035
+    for pose in track.refined.values():
+        cov = np.reshape(pose.cov, (6, 6))
+        assert np.linalg.eigvalsh(cov)[0] > 0.0 and cov[:2, :2] == pytest.approx(
+            np.array([[pose.sigma_e_m**2, pose.cov_en_m2], [pose.cov_en_m2, pose.sigma_n_m**2]])
+        )
     assert {m.source for m in track.published} == {RefinementSource.SMOOTHER}
+
+
+def test_the_smoother_of_the_default_configuration_refines_and_a_switched_off_one_does_not(tmp_path: Path) -> None:
+    refined = {}
+    for enabled in (True, False):
+        config = Config() if enabled else Config(smoother=SmootherSection(enabled=False))
+        track = Track(smoother=make_node(NodeContext(config, MemoryFrameStore(1), None, tmp_path)))
+        track.fly(0, 20)
+        track.feed([track.anchor(0), track.anchor(19), track.prediction(20)])
+        refined[enabled] = len(track.refined)
+    assert refined[True] >= 19 and refined[False] == 0
+
+
+def test_the_scale_of_a_submap_is_that_by_which_its_relative_poses_are_too_short() -> None:
+    track = Track(drift_share=-0.05)
+    track.fly(0, 40)
+    track.feed([*(track.anchor(i) for i in range(0, 40, 3)), track.prediction(46)])
+    assert min(pose.m_per_unit or 0.0 for pose in track.refined.values()) > 1.02
+    assert track.refined[20].m_per_unit == pytest.approx(1.0 / 0.95, abs=0.02)
 
 
 def test_a_relocalisation_closes_a_loop_without_any_map() -> None:

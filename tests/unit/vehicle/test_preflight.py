@@ -30,7 +30,7 @@ from terrafix_tools.mission.items import Do, Item, Mission
 from terrafix_tools.preflight import autopilot as conversation
 from terrafix_tools.preflight import computer, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
-from terrafix_tools.preflight.lines import Line, Status, number
+from terrafix_tools.preflight.lines import CheckStatus, Line, number
 from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.rules import ALWAYS, GPS_INPUT_RULES, LOCAL_RULES, Context
 from terrafix_tools.preflight.run import _parameter_lines, _vehicle_lines, preflight
@@ -96,7 +96,7 @@ def lines_by_check(values: dict[str, float], at: Context) -> dict[str, Line]:
 )
 def test_the_presets_pass_all_rules(name: str, plane: bool, gps_id: int) -> None:
     lines = lines_by_check(DEFAULTS | preset(name), context(plane=plane, gps_id=gps_id))
-    assert {c: line.text for c, line in lines.items() if line.status is not Status.OK} == {}
+    assert {c: line.text for c, line in lines.items() if line.status is not CheckStatus.OK} == {}
 
 
 @pytest.mark.parametrize(("plane", "name"), [(True, "plane"), (False, "copter")])
@@ -104,7 +104,7 @@ def test_the_proposed_changes_on_a_new_autopilot_are_the_preset(plane: bool, nam
     changes = {c.name: c.new for c in proposed_changes(check_parameters(DEFAULTS, context(plane=plane)))}
     assert changes.items() <= preset(name).items()
     after = DEFAULTS | changes
-    assert all(line.status is Status.OK for line in check_parameters(after, context(plane=plane)))
+    assert all(line.status is CheckStatus.OK for line in check_parameters(after, context(plane=plane)))
 
 
 @pytest.mark.parametrize(("name", "gps_id"), [("plane", 0), ("copter", 0), ("second-gps", 1)])
@@ -247,7 +247,7 @@ def test_local_frame_outputs_have_their_own_rules() -> None:
         "EK3_SRC2_VELXY": 6,
         "AHRS_OPTIONS": 1,
     }
-    assert all(line.status is Status.OK for line in check_parameters(good, at))
+    assert all(line.status is CheckStatus.OK for line in check_parameters(good, at))
     loop = lines_by_check(good | {"EK3_SRC2_YAW": 6}, at)["source set"]
     assert "the autopilot's own" in loop.text
     blind = lines_by_check(good, context(outputs=["vision_position"]))["source set"]
@@ -461,9 +461,10 @@ def test_restore_leaves_the_state_of_another_vehicle(wired: Wired, second: list[
     assert PreviousSourceFile(state).load() is not None
 
 
-def test_without_confirmation_nothing_is_set(wired: Wired, tmp_path: Path) -> None:
+@pytest.mark.parametrize("answer", ["n\n", "\n"], ids=["no", "return alone"])
+def test_without_confirmation_nothing_is_set(wired: Wired, tmp_path: Path, answer: str) -> None:
     there = wired(DEFAULTS)
-    done = run("--write", "--autopilot-only", "--out", str(tmp_path), answer="n\n")
+    done = run("--write", "--autopilot-only", "--out", str(tmp_path), answer=answer)
     assert done.exit_code == 1
     assert "GPS1_TYPE        1 -> 14" in done.output
     assert there.parameters_set == []
@@ -497,7 +498,7 @@ def test_correlation_on_a_gpu_is_checked_where_it_is_configured(tmp_path: Path) 
         return [line for line in lines if line.check == "correlation"]
 
     (line,) = correlation_lines(Models(correlation="gpu", folder=str(tmp_path)))
-    assert line.status is Status.FAIL and "no model is called 'correlation-512'" in line.text
+    assert line.status is CheckStatus.FAIL and "no model is called 'correlation-512'" in line.text
     assert "terrafix models export" in line.fix
     assert correlation_lines(Models(folder=str(tmp_path))) == []
 

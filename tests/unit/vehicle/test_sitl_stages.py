@@ -21,7 +21,7 @@ from terrafix_lab.sim.sitl.stages import FlightAborted, Stages
 HOME = Home(48.0, 14.0, 320.0, 90.0)
 
 
-class Station:
+class StubStation:
     """Ground station stub; rejects arming ``refusals`` times, and has the parameters in ``known``."""
 
     def __init__(self, refusals: int = 0, known: tuple[str, ...] = ("SIM_GPS_DISABLE",)) -> None:
@@ -50,7 +50,7 @@ class Station:
         return self.values[name]
 
 
-class Camera:
+class StubCamera:
     paused = False
 
     def pause(self) -> None:
@@ -83,14 +83,14 @@ def short_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl_stages, "POLL_S", 0.01)
 
 
-def made(log: FlightLog, station: Station | None = None) -> tuple[Stages, Station, Daemon]:
-    station, daemon = station or Station(), Daemon()
+def made(log: FlightLog, station: StubStation | None = None) -> tuple[Stages, StubStation, Daemon]:
+    station, daemon = station or StubStation(), Daemon()
     firmware: Any = SimpleNamespace(check=lambda: None)
     scene: Any = SimpleNamespace(home=HOME, mission=None)
     observer: Any = SimpleNamespace(log=log)
     any_station: Any = station
     any_daemon: Any = daemon
-    camera: Any = Camera()
+    camera: Any = StubCamera()
     return Stages(firmware, any_station, observer, any_daemon, camera, scene, Console(quiet=True)), station, daemon
 
 
@@ -119,14 +119,14 @@ def test_terrafix_starts_after_the_autopilot_has_a_position() -> None:
 
 
 def test_arming_is_retried_and_precedes_the_mission() -> None:
-    stages, station, _ = made(FlightLog(), Station(refusals=3))
+    stages, station, _ = made(FlightLog(), StubStation(refusals=3))
     stages.take_off()
     assert station.done == ["arm", "start"] and stages.times.armed_ns is not None
 
 
 def test_failing_pre_arm_checks_abort_the_flight_with_the_reason() -> None:
     log = FlightLog(texts=[StatusTextRecord(0, 2, "PreArm: Gyros inconsistent")])
-    stages, _, _ = made(log, Station(refusals=10**6))
+    stages, _, _ = made(log, StubStation(refusals=10**6))
     with pytest.raises(FlightAborted, match="COMMAND_DENIED; last text: PreArm: Gyros inconsistent"):
         stages.take_off()
 
@@ -143,7 +143,7 @@ def test_the_gnss_stays_on_until_terrafix_is_ready(height_m: float, fix_since_s:
 def test_the_receiver_is_disabled_by_the_parameter_of_the_firmware(known: str) -> None:
     log = flying()
     log.fix_types[0].extend([(6, 1), (7, 6), (8, 1), (9, 1)])  # two reports before the next poll
-    stages, station, _ = made(log, Station(known=(known,)))
+    stages, station, _ = made(log, StubStation(known=(known,)))
     stages.lose_gnss()
     assert station.done == [(known, 1 if known == "SIM_GPS_DISABLE" else 0)] and stages.times.lost_ns == 8
 
@@ -151,7 +151,7 @@ def test_the_receiver_is_disabled_by_the_parameter_of_the_firmware(known: str) -
 def test_a_receiver_that_stays_on_aborts_the_flight() -> None:
     log = flying()
     log.fix_types[0].append((7, 6))
-    stages, _, _ = made(log, Station(known=()))
+    stages, _, _ = made(log, StubStation(known=()))
     with pytest.raises(FlightAborted, match="no loss of the GNSS within"):
         stages.lose_gnss()
 
@@ -199,11 +199,11 @@ def test_the_camera_is_off_for_the_stated_time(monkeypatch: pytest.MonkeyPatch) 
 def test_a_spoof_ends_with_the_position_source_from_before_it(restored: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("SPOOFED_S", "DOWN_S", "SWITCH_S"):
         monkeypatch.setattr(sitl_stages, name, 0.05)
-    station = Station(known=("SIM_GPS_GLITCH_X",))  # the name up to 4.6
+    station = StubStation(known=("SIM_GPS_GLITCH_X",))  # the name up to 4.6
     stages, _, daemon = made(flying(), station)
 
     def shifted(name: str, value: float) -> None:
-        Station.set_parameter(station, name, value)
+        StubStation.set_parameter(station, name, value)
         station.values["GPS_PRIMARY"] = 1
 
     station.set_parameter = shifted  # type: ignore[method-assign]

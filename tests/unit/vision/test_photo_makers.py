@@ -246,6 +246,14 @@ def test_gimbal_angles_of_zero_leave_the_flights_heading_and_a_wide_mount(tmp_pa
     assert any("gimbal angles of 0/0/0: not reported (3 photos)" in fact.text for fact in facts_of(source))
 
 
+def test_a_stated_accuracy_of_the_tilt_replaces_that_of_photos(tmp_path: Path) -> None:
+    for i in range(2):
+        photo(tmp_path / f"{i}.jpg", dji(**CALIBRATED, **NADIR), at_s=i)
+    assert open_source(str(tmp_path)).origin().attitude_sigma_deg == 9.0
+    (tmp_path / "flight.toml").write_text("[telemetry]\nattitude_sigma_deg = 2.0\n")
+    assert open_source(str(tmp_path)).origin().attitude_sigma_deg == 2.0
+
+
 @pytest.mark.parametrize(
     ("xmp", "unknown"),
     [

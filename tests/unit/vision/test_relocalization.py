@@ -32,7 +32,7 @@ BEYOND = line((-200.0, -100.0), (-200.0, -600.0), 180.0)
 CROSSING = range(len(OUT + ASIDE + AWAY), len(OUT + ASIDE + AWAY + BACK))  # frames of BACK
 
 
-class Flown:
+class ReplayedPlaces:
     """Two frames a second. A place of None is a black image."""
 
     def __init__(self, ground: np.ndarray) -> None:
@@ -41,7 +41,7 @@ class Flown:
         list(self.node.on(ORIGIN))
         self.published: list[Message] = []
 
-    def fly(self, places: list[Place] | list[None], error: str = "", interval_s: float = 1.0) -> "Flown":
+    def fly(self, places: list[Place] | list[None], error: str = "", interval_s: float = 1.0) -> "ReplayedPlaces":
         for place in places:
             i = len(self.places)
             self.places.append(place)
@@ -71,11 +71,11 @@ class Flown:
 
 
 @pytest.fixture(scope="module")
-def crossed(ground: np.ndarray) -> Flown:
-    return Flown(ground).fly(OUT + ASIDE + AWAY + BACK + BEYOND)
+def crossed(ground: np.ndarray) -> ReplayedPlaces:
+    return ReplayedPlaces(ground).fly(OUT + ASIDE + AWAY + BACK + BEYOND)
 
 
-def test_a_crossing_of_the_old_track_at_another_heading_is_found_with_its_motion(crossed: Flown) -> None:
+def test_a_crossing_of_the_old_track_at_another_heading_is_found_with_its_motion(crossed: ReplayedPlaces) -> None:
     run = crossed
     crossing = [m for m in run.found() if m.frame_id in CROSSING]
     assert crossing
@@ -90,12 +90,12 @@ def test_a_crossing_of_the_old_track_at_another_heading_is_found_with_its_motion
         assert m.t_ns == m.frame_id * 1_000_000_000
 
 
-def test_ground_that_was_not_seen_before_is_never_relocalised(crossed: Flown) -> None:
+def test_ground_that_was_not_seen_before_is_never_relocalised(crossed: ReplayedPlaces) -> None:
     assert [m for m in crossed.found() if m.frame_id not in CROSSING] == []
 
 
 def test_a_new_fragment_is_connected_to_an_old_one_over_the_same_ground(ground: np.ndarray) -> None:
-    run = Flown(ground).fly(OUT)
+    run = ReplayedPlaces(ground).fly(OUT)
     run.fly([None] * 8).fly(line((-10.0, -100.0), (-10.0, 100.0), 40.0))
     assert max(run.fragments()) >= 1
     found = run.found()
@@ -106,7 +106,7 @@ def test_a_new_fragment_is_connected_to_an_old_one_over_the_same_ground(ground: 
 def test_the_oldest_of_several_keyframes_of_one_place_is_preferred(ground: np.ndarray) -> None:
     there = line((0.0, -100.0), (0.0, 100.0), 0.0)
     away = line((300.0, -100.0), (300.0, 100.0), 0.0)
-    run = Flown(ground).fly(there)
+    run = ReplayedPlaces(ground).fly(there)
     for offset_m in (7.0, 14.0):  # the very same views would be repeated images
         run.fly([None] * 8).fly(away).fly([None] * 8).fly([(e_m + offset_m, n_m, 5.0) for e_m, n_m, _ in there])
     third = [m for m in run.found() if m.frame_id >= len(run.places) - len(there)]
@@ -114,11 +114,11 @@ def test_the_oldest_of_several_keyframes_of_one_place_is_preferred(ground: np.nd
 
 
 def test_the_last_keyframes_of_the_same_fragment_are_not_relocalised(ground: np.ndarray) -> None:
-    assert Flown(ground).fly(line((0.0, -300.0), (0.0, 0.0), 0.0, 8.0)).found() == []
+    assert ReplayedPlaces(ground).fly(line((0.0, -300.0), (0.0, 0.0), 0.0, 8.0)).found() == []
 
 
 def test_at_most_one_search_a_second(ground: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    run, searched = Flown(ground), list[int]()
+    run, searched = ReplayedPlaces(ground), list[int]()
     run.fly(OUT[:1])
     assert run.node._search is not None
     describe = run.node._search._describe
@@ -129,13 +129,13 @@ def test_at_most_one_search_a_second(ground: np.ndarray, monkeypatch: pytest.Mon
 
 def test_while_frames_are_dropped_nothing_is_searched(ground: np.ndarray) -> None:
     """Not while newer frames come before older ones are done; frames that are broken do not matter."""
-    run = Flown(ground).fly(OUT[:15] + line((0.0, 0.0), (400.0, 0.0), 90.0) + AWAY[15:])
+    run = ReplayedPlaces(ground).fly(OUT[:15] + line((0.0, 0.0), (400.0, 0.0), 90.0) + AWAY[15:])
     assert run.fly(BACK, error=OVERTAKEN).found() == []
     assert {m.verdict for m in run.published[-len(BACK) :] if isinstance(m, Odometry)} >= {Verdict.OVERTAKEN}
     assert run.fly(BACK[::-1], error="broken JPEG").found() != []
 
 
-def test_odometry_is_published_before_the_search(crossed: Flown) -> None:
+def test_odometry_is_published_before_the_search(crossed: ReplayedPlaces) -> None:
     for m in crossed.found():
         at = crossed.published.index(m)
         before = crossed.published[at - 1]
@@ -143,14 +143,14 @@ def test_odometry_is_published_before_the_search(crossed: Flown) -> None:
 
 
 def test_a_black_frame_is_neither_found_nor_kept(ground: np.ndarray) -> None:
-    run = Flown(ground).fly([None] * 12)
+    run = ReplayedPlaces(ground).fly([None] * 12)
     assert run.found() == [] and run.node._search is not None and len(run.node._search.database) == 0
     assert Verdict.ACCEPTED in {m.verdict for m in run.published if isinstance(m, Odometry)}
 
 
 def test_ground_that_a_kept_keyframe_shows_is_not_kept_again(ground: np.ndarray) -> None:
     there, away = line((0.0, -100.0), (0.0, 100.0), 0.0), line((300.0, -100.0), (300.0, 100.0), 0.0)
-    run = Flown(ground).fly(there + away)
+    run = ReplayedPlaces(ground).fly(there + away)
     assert run.node._search is not None
     once = len(run.node._search.database)
     run.fly([(e_m + 5.0, n_m, 3.0) for e_m, n_m, _ in [*there, *away, *there]])

@@ -42,9 +42,10 @@ def test_photos_say_where_each_number_comes_from(tmp_path: Path) -> None:
     found = facts(open_source(str(folder), start=(48.0, 11.0)))
     assert found["camera"].startswith("320x240 px, focal length 280.0 px (1-sigma 3 %) from CalibratedFocalLength")
     assert "principal point 161.5, 118.5" in found["camera"] and "FC3582" in found["camera"]
-    assert found["mount"].endswith("1-sigma 3, from gimbal angles of DJI in 6 of 6 photos")
+    assert found["mount"].endswith("1-sigma 9, from gimbal angles of DJI in 6 of 6 photos")
+    assert found["tilt"] == "6 values from the photos, 1-sigma 9 degrees"
     assert found["start"] == "48.000000, 11.000000 (1-sigma 10 m) from --start"
-    assert found["height"] == "RelativeAltitude of DJI in 6 of 6 photos"
+    assert found["height"] == "RelativeAltitude of DJI in 6 of 6 photos, 1-sigma 5 m"
     assert found["clock"] == "DateTimeOriginal of 6 of 6 photos, without fractions of a second"
     assert found["gaps"].startswith("1 gaps between photos, the longest 2") and "7.jpg" in found["left out"]
 
@@ -52,7 +53,7 @@ def test_photos_say_where_each_number_comes_from(tmp_path: Path) -> None:
 def test_a_flight_folder_says_its_columns_and_what_it_does_not_state(tmp_path: Path) -> None:
     found = facts(open_source(str(flight(tmp_path / "f", 5))))
     assert found["rate"] == "5 frames in 2.0 s, 2 a second"
-    assert found["heading"] == "5 values from frames.csv" and found["tilt"] == "not stated"
+    assert found["heading"] == "5 values from frames.csv, 1-sigma 3 degrees" and found["tilt"] == "not stated"
     assert found["start"].endswith("from [start] of flight.toml")
     without = TOML.replace("[start]\nlat_deg = 48.0\nlon_deg = 2.0\n", "")
     assert facts(open_source(str(flight(tmp_path / "g", 5, toml=without))))["start"].startswith("not stated: searched")

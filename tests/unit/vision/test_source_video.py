@@ -51,6 +51,16 @@ def test_a_video_is_sampled_by_its_timestamps(tmp_path: Path) -> None:
     assert len(every) == 30
 
 
+def test_subtitles_of_dji_are_the_telemetry_of_a_video_without_a_table(tmp_path: Path) -> None:
+    path = video(tmp_path / "flight.mp4", 1.0)
+    path.with_suffix(".SRT").write_text("1\n00:00:00,200 --> 00:00:00,233\n[rel_alt: 61.3 abs_alt: 590.1]\n")
+    states = [state for shot in open_source(str(path)).shots() for state in shot.states]
+    assert [(state.t_ns, state.agl_m) for state in states] == [(200_000_000, 61.3)]
+    path.with_suffix(".csv").write_text("t_s,agl_m\n0.3,50\n")
+    states = [state for shot in open_source(str(path)).shots() for state in shot.states]
+    assert [state.agl_m for state in states] == [50.0]
+
+
 def test_invalid_videos_are_reported(tmp_path: Path) -> None:
     path = video(tmp_path / "flight.mp4", 1.0)
     path.with_suffix(".toml").write_text(TOML.replace("width = 320", "width = 640"))

@@ -49,11 +49,11 @@ MECHANISMS: dict[str, Mechanism] = {
         {"update": _returns(), "passed": property(_returns(True)), "wrong_probability": property(_returns(0.0))},
     ),
     "place": Mechanism(f"{_ANCHOR}.converged_place", "PlaceTest", {"update": lambda *_, dominant: dominant}),
-    "map": Mechanism(f"{_INTEGRITY}.map_consistency", "MapConsistency", {"_add": _returns()}),
+    "map": Mechanism(f"{_INTEGRITY}.other_ground", "OtherGround", {"on_rejected": _returns(), "on_pose": _returns()}),
     "alternative": Mechanism(
         f"{_INTEGRITY}.alternative_position",
         "AlternativePosition",
-        {"spawn": _returns(), "switch": _returns(), "probability": property(_returns(0.0))},
+        {"spawn": _returns(), "switch": _returns()},
     ),
     "modes": Mechanism(f"{_INTEGRITY}.position_hypotheses", "PositionHypotheses", {"update_modes": _returns()}),
     "fragments": Mechanism(f"{_INTEGRITY}.fragments", "Fragment", {"add_frame": _confirm}),

@@ -17,7 +17,7 @@ import typer
 from rasterio.errors import RasterioIOError
 
 from terrafix.core.errors import OutputError, UsageError
-from terrafix_lab.accept.cases_table import Case, Line, lines_of, markdown
+from terrafix_lab.accept.cases_table import Case, CaseLine, lines_of, markdown
 from terrafix_lab.accept.run import AcceptOptions, accept, truth_of
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights import make as making
@@ -129,9 +129,9 @@ def _folder(name: str) -> str:
     return name.replace(",", "").replace(" ", "-")
 
 
-def fly(cases: Iterator[Case], out: Path) -> list[Line]:
+def fly(cases: Iterator[Case], out: Path) -> list[CaseLine]:
     """Flies the cases in order and rewrites adversary.json and adversary.md after each. Raises TerrafixError."""
-    lines: list[Line] = []
+    lines: list[CaseLine] = []
     for case in cases:
         typer.echo(f"== {case.name}", err=True)
         lines += lines_of(case, accept(case.options))
@@ -139,7 +139,7 @@ def fly(cases: Iterator[Case], out: Path) -> list[Line]:
     return lines
 
 
-def _write(out: Path, lines: list[Line]) -> None:
+def _write(out: Path, lines: list[CaseLine]) -> None:
     text = {"json": json.dumps([msgspec.to_builtins(line) for line in lines], indent=1), "md": markdown(lines)}
     for suffix, content in text.items():
         target = out / f"{NAME}.{suffix}"

@@ -23,7 +23,7 @@ class Case:
     options: AcceptOptions
 
 
-class Line(msgspec.Struct, frozen=True, kw_only=True):
+class CaseLine(msgspec.Struct, frozen=True, kw_only=True):
     """One scenario over one place. None: not measured. ``why``: the reason if nothing was measured."""
 
     scenario: str
@@ -40,11 +40,11 @@ class Line(msgspec.Struct, frozen=True, kw_only=True):
     why: str = ""
 
 
-def lines_of(case: Case, acceptance: Acceptance) -> list[Line]:
+def lines_of(case: Case, acceptance: Acceptance) -> list[CaseLine]:
     return [_line(case.name, result) for result in acceptance.results]
 
 
-def _line(place: str, result: Result) -> Line:
+def _line(place: str, result: Result) -> CaseLine:
     rows = {row.what: row for row in result.rows}
 
     def value(*names: str) -> float | None:
@@ -52,7 +52,7 @@ def _line(place: str, result: Result) -> Line:
         return next((rows[CRITERIA[n].what].measured for n in names if CRITERIA[n].what in rows), None)
 
     recovery: JudgedRow | None = rows.get(CRITERIA["recovery"].what)
-    return Line(
+    return CaseLine(
         scenario=result.scenario,
         place=place,
         frames=result.frames,
@@ -68,7 +68,7 @@ def _line(place: str, result: Result) -> Line:
     )
 
 
-def markdown(lines: list[Line]) -> str:
+def markdown(lines: list[CaseLine]) -> str:
     """First the table over all places, then that of each flight."""
     names = list(dict.fromkeys(line.scenario for line in lines))
     head = ("frames", "within 20 m", "false", "late false", "to notice", "recovery", "claim", "broken")
@@ -91,7 +91,7 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
     return ["| " + " | ".join(cells) + " |" for cells in (head, ("---",) * len(head), *rows)]
 
 
-def _pooled(name: str, lines: list[Line]) -> tuple[str, ...]:
+def _pooled(name: str, lines: list[CaseLine]) -> tuple[str, ...]:
     flown = [line for line in lines if line.frames]
     frames = sum(line.frames for line in flown)
     within = sum((line.within_20m or 0.0) * line.frames for line in flown) / frames if frames else None
@@ -111,7 +111,7 @@ def _pooled(name: str, lines: list[Line]) -> tuple[str, ...]:
     )
 
 
-def _one(line: Line) -> tuple[str, ...]:
+def _one(line: CaseLine) -> tuple[str, ...]:
     if not line.frames:
         return (line.scenario, line.place, f"not flown: {line.why}", *[""] * 7)
     return (

@@ -23,7 +23,7 @@ from terrafix_lab.faults.edits import Edit, Span
 from terrafix_lab.faults.source import Stepwise
 from terrafix_lab.sim.closed_loop.flight import FRAME_HZ as LOOP_HZ
 from terrafix_lab.sim.closed_loop.flight import Conditions, plan_over
-from terrafix_lab.sim.closed_loop.loop import Plan, fly
+from terrafix_lab.sim.closed_loop.loop import LoopPlan, fly
 from terrafix_lab.sim.flights.folder import FRAME_HZ
 from terrafix_lab.sim.flights.scene import Scene, scene_of_world
 from terrafix_lab.sim.interfaces import State
@@ -84,7 +84,7 @@ def _scene(seed: int) -> Scene:
 
 def _plan(
     scene: Scene, package: Path, events: tuple[AnyEvent, ...], frame_hz: float, *, seed: int, frames: int
-) -> Plan:
+) -> LoopPlan:
     """``frames``: gives the duration, as of a recorded flight."""
     duration_s = frames / FRAME_HZ
     return plan_over(

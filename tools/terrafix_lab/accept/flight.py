@@ -29,7 +29,7 @@ class FrameRef(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Flight:
+class AcceptFlight:
     source: str  # argument of open_source
     map_path: Path | None  # None: that of the flight
     dem: Path | None
@@ -65,7 +65,7 @@ class Flight:
             return next(shot.image for shot in shots if shot.image is not None)
 
 
-def open_flight(source: str, map_path: Path | None, dem: Path | None, truth: Path, frames: int | None) -> Flight:
+def open_flight(source: str, map_path: Path | None, dem: Path | None, truth: Path, frames: int | None) -> AcceptFlight:
     """Reads the flight once. ``frames``: limit of the frames. Raises SourceError, EvaluationError."""
     opened = open_source(source)
     camera = opened.origin().camera
@@ -82,7 +82,7 @@ def open_flight(source: str, map_path: Path | None, dem: Path | None, truth: Pat
     heights = [ref.state.agl_m for ref in frame_refs if ref.state and ref.state.agl_m is not None]
     agl_m = float(np.median(heights)) if heights else DEFAULT_AGL_M
     footprint_m = agl_m * float(np.hypot(camera.width / camera.fx, camera.height / camera.fy))
-    return Flight(source, map_path, dem, known, frame_refs, footprint_m)
+    return AcceptFlight(source, map_path, dem, known, frame_refs, footprint_m)
 
 
 def read_any_truth(path: Path, files: list[str]) -> dict[str, Truth]:

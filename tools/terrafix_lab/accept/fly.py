@@ -21,7 +21,7 @@ from terrafix.map.format import CE90_SIGMAS
 from terrafix.messages import Frame, Message
 from terrafix.vision.sources import Source
 from terrafix_lab.accept.false_inputs.integrity import claim_width, in_lie
-from terrafix_lab.accept.flight import Flight, open_flight
+from terrafix_lab.accept.flight import AcceptFlight, open_flight
 from terrafix_lab.accept.long_route import ThereAndBack
 from terrafix_lab.accept.measuring.criteria import judge, unmeasured
 from terrafix_lab.accept.measuring.evidence import Evidence, gather
@@ -179,13 +179,13 @@ def _not_flown(scenario: Scenario, why: str) -> Result:
     return Result(scenario=scenario.name, promise=scenario.promise, rows=rows)
 
 
-def _altered(source: Source, flight: Flight, plan: Plan, frames: int | None) -> Source:
+def _altered(source: Source, flight: AcceptFlight, plan: Plan, frames: int | None) -> Source:
     if plan.long_route and len(flight.frame_refs) < LONG_FRAMES:
         source, frames = ThereAndBack(source, flight.frame_refs, LONG_FRAMES), None
     return AlteredSource(source, plan.edit, frames=frames, origin=plan.origin)
 
 
-def _package(flight: Flight, plan: Plan, out: Path) -> tuple[Path | None, str]:
+def _package(flight: AcceptFlight, plan: Plan, out: Path) -> tuple[Path | None, str]:
     """-> the map to fly with (None: that of the flight), or the reason why it cannot be made."""
     if plan.other_map is None:
         if flight.map_path is None:

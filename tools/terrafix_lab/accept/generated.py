@@ -23,7 +23,7 @@ HILL_SIGMA_POSTS = 40.0
 
 
 @dataclass(frozen=True)
-class Kind:
+class GroundKind:
     """One kind of ground: changes to the looks of the place and to its relief."""
 
     looks: tuple[str, str] = (MAP_LOOK, CAMERA_LOOK)
@@ -33,11 +33,11 @@ class Kind:
 
 
 KINDS = {
-    "base": Kind(),
-    "season": Kind(looks=(MAP_LOOK, WINTER_LOOK)),
-    "low texture": Kind(contrast=LOW_CONTRAST),
-    "water": Kind(lake=True),
-    "hills": Kind(hills=True),
+    "base": GroundKind(),
+    "season": GroundKind(looks=(MAP_LOOK, WINTER_LOOK)),
+    "low texture": GroundKind(contrast=LOW_CONTRAST),
+    "water": GroundKind(lake=True),
+    "hills": GroundKind(hills=True),
 }
 
 

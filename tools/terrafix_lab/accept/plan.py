@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from terrafix.core.node import Node, NodeContext
-from terrafix_lab.accept.flight import Flight
+from terrafix_lab.accept.flight import AcceptFlight
 from terrafix_lab.accept.measuring.criteria import PERMANENT, SCARCE, TEMPORARY, WITH_SPAN
 from terrafix_lab.accept.measuring.results import Marks
 from terrafix_lab.faults.edits import Edit, OriginEdit, unchanged, unchanged_origin
@@ -37,11 +37,11 @@ class Plan:
     marks: Marks = field(default_factory=Marks)
 
 
-def without_fault(_: Flight) -> Plan:
+def without_fault(_: AcceptFlight) -> Plan:
     return Plan()
 
 
-def plan_of(fault: Fault, flight: Flight) -> Plan | str:
+def plan_of(fault: Fault, flight: AcceptFlight) -> Plan | str:
     """With the fault of the table from its usual time on."""
     if flight.duration_s < fault.flight_s:
         return f"the flight lasts only {flight.duration_s:.0f} s"
@@ -69,7 +69,7 @@ class Scenario:
     name: str
     promise: str
     criteria: tuple[str, ...]
-    plan: Callable[[Flight], Plan | str]  # a text: the reason why this flight cannot be used
+    plan: Callable[[AcceptFlight], Plan | str]  # a text: the reason why this flight cannot be used
     ground: str = "base"  # of the generated world; a given flight has only "base"
     frames: int = FRAMES  # of a generated flight
 

@@ -9,7 +9,7 @@ import numpy as np
 from terrafix.core.node import Image, Node, NodeContext
 from terrafix_lab.accept.false_inputs.maps import REACH, stale_along
 from terrafix_lab.accept.false_inputs.scenarios import LIES
-from terrafix_lab.accept.flight import Flight
+from terrafix_lab.accept.flight import AcceptFlight
 from terrafix_lab.accept.measuring.criteria import EVERYWHERE, WITH_SPAN
 from terrafix_lab.accept.measuring.results import Marks
 from terrafix_lab.accept.plan import CLOSED_LOOP, FRAMES, Plan, Scenario, plan_of, scenario_of, without_fault
@@ -32,14 +32,14 @@ LONG_FRAMES = 1500
 KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the opposite: 990 m, with a stated sigma of tens of metres
 
 
-def _foreign_frame(flight: Flight) -> Plan | str:
+def _foreign_frame(flight: AcceptFlight) -> Plan | str:
     if len(flight.frame_refs) < 8:
         return f"the flight has only {len(flight.frame_refs)} frames"
     mirrored = pictures.mirrored(flight.picture(0))
     return _foreign({flight.frame_refs[flight.at(share)].file: mirrored for share in FOREIGN_AT})
 
 
-def _far_frame(flight: Flight) -> Plan | str:
+def _far_frame(flight: AcceptFlight) -> Plan | str:
     track = flight.track_m()
     away = np.hypot(*(track[:, None] - track[None, :]).transpose(2, 0, 1))
     there = np.where(away >= FAR_M, away, np.inf).argmin(axis=1)  # the nearest frame that is far enough
@@ -57,13 +57,13 @@ def _foreign(shown: dict[str, Image]) -> Plan:
     )
 
 
-def _outlier_fix(flight: Flight) -> Plan | str:
+def _outlier_fix(flight: AcceptFlight) -> Plan | str:
     plan = plan_of(FAULTS["350 m outlier fix"], flight)
     wrong = frozenset(s.file for s in flight.frame_refs[OUTLIER_EVERY // 2 :: OUTLIER_EVERY])
     return plan if isinstance(plan, str) else replace(plan, marks=Marks(wrong_files=wrong))
 
 
-def _gap(flight: Flight, low: int, high: int, turning: bool) -> tuple[int, int] | str:
+def _gap(flight: AcceptFlight, low: int, high: int, turning: bool) -> tuple[int, int] | str:
     """(first, end) of the frames to delete so that the frames before and after them do not overlap.
 
     Between the frames ``low`` and ``high``: where the track turns most, or (``turning`` False) the shortest gap."""
@@ -83,7 +83,7 @@ def _gap(flight: Flight, low: int, high: int, turning: bool) -> tuple[int, int] 
     return (best[1], best[2]) if best else "no part of the flight is long enough to leave ground out"
 
 
-def _gaps(flight: Flight, parts: tuple[tuple[float, float], ...], turning: bool) -> Plan | str:
+def _gaps(flight: AcceptFlight, parts: tuple[tuple[float, float], ...], turning: bool) -> Plan | str:
     gone: set[str] = set()
     spans, breaks = [], []
     for low, high in parts:
@@ -96,19 +96,19 @@ def _gaps(flight: Flight, parts: tuple[tuple[float, float], ...], turning: bool)
     return Plan(edits.without_frames(frozenset(gone)), marks=Marks(spans=tuple(spans), breaks_s=tuple(breaks)))
 
 
-def _sharp_turn(flight: Flight) -> Plan | str:
+def _sharp_turn(flight: AcceptFlight) -> Plan | str:
     return _gaps(flight, ((0.25, 0.75),), turning=True)
 
 
-def _three_fragments(flight: Flight) -> Plan | str:
+def _three_fragments(flight: AcceptFlight) -> Plan | str:
     return _gaps(flight, ((0.15, 0.5), (0.5, 0.85)), turning=False)
 
 
-def _share_of(flight: Flight, shares: tuple[float, float], text: str) -> Span:
+def _share_of(flight: AcceptFlight, shares: tuple[float, float], text: str) -> Span:
     return Span(flight.frame_refs[flight.at(shares[0])].t_s, flight.frame_refs[flight.at(shares[1])].t_s, text)
 
 
-def _unmatchable(flight: Flight) -> Plan | str:
+def _unmatchable(flight: AcceptFlight) -> Plan | str:
     if not flight.has_raster_map:
         return "needs the map as a GeoTIFF, to make it stale along a fifth of the route"
     shares = _fifth(flight)
@@ -121,7 +121,7 @@ def _unmatchable(flight: Flight) -> Plan | str:
     return Plan(other_map=other_map, marks=Marks(spans=(_share_of(flight, shares, "the map shows other ground"),)))
 
 
-def _fifth(flight: Flight) -> tuple[float, float]:
+def _fifth(flight: AcceptFlight) -> tuple[float, float]:
     """Start and end, as shares of the frames, of the fifth whose ground is least visible in the other frames.
 
     Otherwise a flight that circles over this ground would have no usable map."""
@@ -136,11 +136,11 @@ def _fifth(flight: Flight) -> tuple[float, float]:
     return begin, begin + UNMATCHABLE
 
 
-def _long_route(_: Flight) -> Plan:
+def _long_route(_: AcceptFlight) -> Plan:
     return Plan(long_route=True)
 
 
-def _blackout(flight: Flight) -> Plan | str:
+def _blackout(flight: AcceptFlight) -> Plan | str:
     needed_s = BEFORE_S + BLACKOUT_S + AFTER_S
     if flight.duration_s < needed_s:
         return f"the flight lasts {flight.duration_s:.0f} s, and {needed_s:.0f} s are needed"
@@ -149,7 +149,7 @@ def _blackout(flight: Flight) -> Plan | str:
     return Plan(pictures.black(span), marks=Marks(spans=(span,)))
 
 
-def _stall(flight: Flight) -> Plan | str:
+def _stall(flight: AcceptFlight) -> Plan | str:
     if flight.duration_s < 3 * STALL_S:
         return f"the flight lasts only {flight.duration_s:.0f} s"
     from_s = flight.frame_refs[flight.at(0.5)].t_s
@@ -157,19 +157,19 @@ def _stall(flight: Flight) -> Plan | str:
     return Plan(pictures.frozen(span), marks=Marks(spans=(span,)))
 
 
-def _over_water(flight: Flight) -> Plan:
+def _over_water(flight: AcceptFlight) -> Plan:
     from terrafix_lab.accept.generated import WATER  # only for generated ground
 
     return Plan(marks=Marks(spans=(_share_of(flight, WATER, "over open water"),)))
 
 
-def _kidnapped(flight: Flight) -> Plan:
+def _kidnapped(flight: AcceptFlight) -> Plan:
     # Towards the centre of the flight, where the map is.
     ahead = np.where(np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0)
     return Plan(origin=edits.start_moved(*(ahead * KIDNAPPED_M).tolist()))
 
 
-def _hot_day(flight: Flight) -> Plan:
+def _hot_day(flight: AcceptFlight) -> Plan:
     span = _share_of(flight, HOT, "thermal throttle")
 
     def nodes(ctx: NodeContext) -> Mapping[str, Node]:

@@ -22,7 +22,6 @@ from rich.table import Table
 
 from terrafix.core.gate import CHI2_95
 from terrafix.core.pose import tangent_to_world
-from terrafix.messages import Message
 from terrafix_lab.bench.result_file import write_result
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Run
@@ -31,7 +30,7 @@ from terrafix_lab.standalone import run_standalone
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, choose
-from terrafix_tools.finalise.run import Placed, heights_as_seen, refined_track, solved_track
+from terrafix_tools.finalise.run import PlacedCamera, heights_as_seen, refined_track, solved_track
 
 SEED, DURATION_S = 41, 300.0
 FOCAL_ERROR, FOCAL_SIGMA, K1_ERROR = 0.03, 0.05, -0.03  # of the true camera, relative; as described; of the true lens
@@ -41,12 +40,8 @@ class RecordedRun(Run):
     """A simulated flight whose estimator keeps what the smoother takes."""
 
     def __init__(self, drawn: FlightPlan, hold_out_every: int = 0) -> None:
-        super().__init__(drawn)
         self.replayer = FlightReplayer(hold_out_every)
-        self._node = self.replayer.node
-
-    def process(self, message: Message) -> list[Message]:
-        return list(self.replayer.on(message))
+        super().__init__(drawn, self.replayer)
 
     def fly(self) -> FlightGraph:
         self.record(refine=False)
@@ -54,11 +49,11 @@ class RecordedRun(Run):
         graph.recorder.store_estimates()
         return graph
 
-    def errors(self, placed: dict[int, Placed]) -> tuple[np.ndarray, np.ndarray]:
+    def errors(self, placed: dict[int, PlacedCamera]) -> tuple[np.ndarray, np.ndarray]:
         """-> error of every frame, east, north and up (N, 3) [m], and its covariance (N, 3, 3), world axes."""
         errors_m, covs = [], []
         for frame_id, at in placed.items():
-            errors_m.append(at.pose.translation() - self._flown.frames[frame_id].p_m)
+            errors_m.append(at.pose.translation() - self.flown.frames[frame_id].p_m)
             covs.append(tangent_to_world(at.cov, at.pose.rotation().matrix()))
         return np.array(errors_m), np.array(covs)
 

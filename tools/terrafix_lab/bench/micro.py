@@ -36,6 +36,7 @@ from terrafix.vision.feature_tracker import FrameTracker
 from terrafix.vision.sources import open_source
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_lab.bench.flights import run_part
+from terrafix_tools.in_process import InProcessShell
 from terrafix_tools.timing import spread
 
 RESULT = "micro.json"
@@ -96,35 +97,34 @@ def _correlations(
 def _estimator(messages: list[Message], band: ThermalBand) -> list[float]:
     """-> time of each frame [ms] after the window is full: odometry in, prediction and estimate out, map match in,
     estimate out, with covariance."""
-    node = EstimatorNode()
-    list(node.on(Health(t_ns=0, band=band, temperature_c=None, throttled=False, disk_free_mb=None, cause="benchmark")))
+    shell = InProcessShell({"estimator": EstimatorNode()}, lambda _, __: None)
+    shell.feed(Health(t_ns=0, band=band, temperature_c=None, throttled=False, disk_free_mb=None, cause="benchmark"))
     times: dict[int, float] = {}
     for message in messages:
         if isinstance(message, Origin | VehicleState):
-            list(node.on(message))
+            shell.feed(message)
         elif isinstance(message, Odometry | MapMatch):
-            elapsed = _ms(partial(_process, node, message))
+            elapsed = _ms(partial(shell.feed, message))
             times[message.frame_id] = times.get(message.frame_id, 0.0) + elapsed
     return list(times.values())[NODES:]
 
 
 def _link(messages: list[Message]) -> list[float]:
     """-> time of the ticks of each second [ms], at the link's tick rate, with the estimates of the record."""
-    node = LinkNode(Config().link.rate_hz)
-    list(node.on(WallClock(t_ns=0, unix_ns=UNIX_NS, source="system")))  # without a clock the link sends nothing
+    shell = InProcessShell({"link": LinkNode(Config().link.rate_hz)}, lambda _, __: None)
+    shell.feed_read("link", WallClock(t_ns=0, unix_ns=UNIX_NS, source="system"))  # without it the link sends nothing
     times_ms, now_ns = [], 0
     for message in messages:
         if isinstance(message, Origin | NavEstimate | VehicleState):
             while now_ns < message.t_ns:
                 now_ns += round(1e9 / TICK_HZ)
-                times_ms.append(_ms(lambda: list(node.tick(now_ns))))  # noqa: B023
-            list(node.on(message))
+                times_ms.append(_ms(partial(shell.tick, now_ns)))
+            if isinstance(message, VehicleState):
+                shell.feed_read("link", message)
+            else:
+                shell.feed(message)
     second = round(TICK_HZ)
     return [sum(times_ms[i : i + second]) for i in range(0, len(times_ms), second)]
-
-
-def _process(node: EstimatorNode, message: Message) -> list[Message]:
-    return list(node.on(message))
 
 
 def _view(prediction: Prediction, ground_m: float) -> View:

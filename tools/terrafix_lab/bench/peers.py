@@ -94,7 +94,7 @@ class ModelPoints:
 
 
 @dataclass
-class Times:
+class FrameTimes:
     """Milliseconds of each frame: by the clock, of the processor, and of these the ones for the points of the map,
     which a system could keep."""
 
@@ -114,7 +114,7 @@ class Peer:
 
     def __init__(self, method: PointMethod, camera: CameraCalibration, local: LocalMap) -> None:
         self._method, self._camera, self._map = method, camera, local
-        self.times = Times()
+        self.times = FrameTimes()
 
     def locate(self, image: Image, prediction: Prediction) -> tuple[float, float] | None:
         """-> (e_m, n_m) of the camera; None: no homography with enough inliers."""
@@ -195,7 +195,7 @@ def measure(flight: Path, map_path: Path, replayed: Path, models: Path | None = 
     local, camera = package.bind(place), CameraCalibration.of(origin.camera)
     peers = {name: Peer(method, camera, local) for name, method in able.items()}
     errors_m: dict[str, list[float]] = {name: [] for name in peers}
-    decoding = Times()
+    decoding = FrameTimes()
     for image, prediction, truth in _frames(flight, predictions, decoding):
         for name, peer in peers.items():
             position_m = peer.locate(image, prediction)
@@ -207,7 +207,7 @@ def measure(flight: Path, map_path: Path, replayed: Path, models: Path | None = 
 
 
 def _frames(
-    flight: Path, predictions: dict[int, Prediction], decoding: Times
+    flight: Path, predictions: dict[int, Prediction], decoding: FrameTimes
 ) -> Iterator[tuple[Image, Prediction, Truth]]:
     """The frames that have a prediction and a truth. Adds the times of reading and decoding to ``decoding``."""
     truth = read_truth(flight / "truth.csv")
@@ -225,7 +225,7 @@ def _frames(
     source.close()
 
 
-def _row(times: Times, decoding: Times, errors_m: list[float]) -> dict[str, Any]:
+def _row(times: FrameTimes, decoding: FrameTimes, errors_m: list[float]) -> dict[str, Any]:
     """-> times of whole frames, as ours are, with their decoding, and accuracy of one method."""
     frames = len(times.cpu_ms)
     kept_ms = np.subtract(times.cpu_ms, times.map_cpu_ms)

@@ -39,7 +39,7 @@ WIDE = 150  # characters of the tables
 
 
 @dataclass(frozen=True)
-class Row:
+class ProcessorRow:
     """``variables``: of the environment. ``needs``: flags of /proc/cpuinfo, without which the kernels cannot run."""
 
     variables: dict[str, str] = field(default_factory=dict)
@@ -49,17 +49,17 @@ class Row:
 AVX2, AVX512 = frozenset({"avx2", "fma"}), frozenset({"avx512f", "avx512dq", "avx512bw", "avx512vl"})
 # Names of OpenCV's as cv2.getCPUFeaturesLine() prints them, of NumPy's as numpy.show_config() does
 ROWS = {
-    "own": Row(),
-    "nehalem": Row({"OPENBLAS_CORETYPE": "Nehalem"}),
-    "sandybridge": Row({"OPENBLAS_CORETYPE": "Sandybridge"}, frozenset({"avx"})),
-    "haswell": Row({"OPENBLAS_CORETYPE": "Haswell"}, AVX2),
-    "zen": Row({"OPENBLAS_CORETYPE": "Zen"}, AVX2),
-    "skylakex": Row({"OPENBLAS_CORETYPE": "SkylakeX"}, AVX512),
-    "opencv-no-avx512": Row({"OPENCV_CPU_DISABLE": "AVX512-SKX"}, AVX512),
-    "opencv-no-avx2": Row({"OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,FMA3"}),
-    "numpy-no-avx2": Row({"NPY_DISABLE_CPU_FEATURES": "X86_V4 X86_V3"}),
-    "haswell-no-avx2": Row({"OPENBLAS_CORETYPE": "Haswell", "OPENCV_CPU_DISABLE": "AVX2,FMA3"}, AVX2),
-    "weakest": Row(
+    "own": ProcessorRow(),
+    "nehalem": ProcessorRow({"OPENBLAS_CORETYPE": "Nehalem"}),
+    "sandybridge": ProcessorRow({"OPENBLAS_CORETYPE": "Sandybridge"}, frozenset({"avx"})),
+    "haswell": ProcessorRow({"OPENBLAS_CORETYPE": "Haswell"}, AVX2),
+    "zen": ProcessorRow({"OPENBLAS_CORETYPE": "Zen"}, AVX2),
+    "skylakex": ProcessorRow({"OPENBLAS_CORETYPE": "SkylakeX"}, AVX512),
+    "opencv-no-avx512": ProcessorRow({"OPENCV_CPU_DISABLE": "AVX512-SKX"}, AVX512),
+    "opencv-no-avx2": ProcessorRow({"OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,FMA3"}),
+    "numpy-no-avx2": ProcessorRow({"NPY_DISABLE_CPU_FEATURES": "X86_V4 X86_V3"}),
+    "haswell-no-avx2": ProcessorRow({"OPENBLAS_CORETYPE": "Haswell", "OPENCV_CPU_DISABLE": "AVX2,FMA3"}, AVX2),
+    "weakest": ProcessorRow(
         {
             "OPENBLAS_CORETYPE": "Sandybridge",
             "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,FMA3",
@@ -79,7 +79,7 @@ SIMULATED = {
 OUTPUTS = {"immediate": (ESTIMATES, ""), "refined": (ESTIMATES, "refined_"), "finalised": (TABLE, "finalised_")}
 
 
-def impossible(row: Row, flags: frozenset[str]) -> str | None:
+def impossible(row: ProcessorRow, flags: frozenset[str]) -> str | None:
     """-> why a processor with these flags cannot run the row; None: it can."""
     missing = sorted(row.needs - flags)
     return f"the processor has no {', '.join(missing)}" if missing else None
@@ -99,7 +99,7 @@ def complete(folder: Path) -> bool:
     return path.is_file() and "finalised" in json.loads(path.read_text(encoding="utf-8"))
 
 
-def fly(flight: Path, row: Row, out: Path) -> None:
+def fly(flight: Path, row: ProcessorRow, out: Path) -> None:
     """Replays, finalises and evaluates ``flight`` in ``out`` with the kernels of ``row``. Raises the TerrafixError of
     the command that failed."""
     for arguments in (
@@ -207,7 +207,7 @@ def main(
         console.print(table)
 
 
-def _known(option: str, names: list[str], known: dict[str, Row] | tuple[str, ...]) -> list[str]:
+def _known(option: str, names: list[str], known: dict[str, ProcessorRow] | tuple[str, ...]) -> list[str]:
     for name in names:
         if name not in known:
             raise UsageError(f"{option} {name}: unknown; one of {', '.join(known)}")

@@ -21,7 +21,7 @@ from rich.table import Table
 from terrafix.core.errors import UsageError
 from terrafix_lab.bench.result_file import write_result
 from terrafix_lab.chaos.rig import Rig
-from terrafix_lab.chaos.scene import Scene
+from terrafix_lab.chaos.scene import ChaosScene
 from terrafix_lab.chaos.shuttle import RUN, shuttle_in
 from terrafix_lab.chaos.verdict import back_s, sigmas, without_fix_s, wrong_fixes
 from terrafix_lab.faults.fault import Action, nothing
@@ -61,7 +61,7 @@ class Kill(msgspec.Struct, frozen=True):
     fix_s: float | None
 
 
-def measure(scene: Scene, out: Path, names: Sequence[str], times: int, seed: int) -> dict[str, object]:
+def measure(scene: ChaosScene, out: Path, names: Sequence[str], times: int, seed: int) -> dict[str, object]:
     """Flies in ``out``, a new folder. Raises SourceError, OSError."""
     kills: list[Kill] = []
     with Rig(scene, out, 0.0, seed=seed) as rig:

@@ -26,7 +26,7 @@ from terrafix.recorder.reader import read_flight
 from terrafix_lab.bench.intervals import IntervalStats, lines_of, measure
 from terrafix_lab.bench.result_file import write_result
 from terrafix_lab.chaos.rig import Rig
-from terrafix_lab.chaos.scene import Scene
+from terrafix_lab.chaos.scene import ChaosScene
 from terrafix_lab.chaos.shuttle import RUN, shuttle_in
 from terrafix_lab.chaos.verdict import sigmas
 from terrafix_lab.faults.fault import Process
@@ -138,7 +138,7 @@ def output_of(record: Path) -> dict[str, Any]:
     }
 
 
-def soak(scene: Scene, out: Path, minutes: float, seed: int, process: Process) -> dict[str, Any]:
+def soak(scene: ChaosScene, out: Path, minutes: float, seed: int, process: Process) -> dict[str, Any]:
     """Flies in ``out``, a new folder, with a fault of the processes from the take-off on. Raises SourceError,
     OSError."""
     samples = Samples()

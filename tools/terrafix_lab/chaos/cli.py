@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from terrafix.core.errors import OutputError, UsageError
+from terrafix_lab.sim.autopilot.parameters import Kind
 
 BROKEN = 1  # exit code
 
@@ -22,6 +23,9 @@ def chaos(
         Path | None, typer.Option(help="Recorded flight folder with truth.csv, whose images and course are flown.")
     ] = None,
     map_path: Annotated[Path | None, typer.Option("--map", help="Its map; default: the one that it names.")] = None,
+    vehicle: Annotated[
+        Kind, typer.Option(help="Of the generated flight: copter from ground to ground, or plane in the air.")
+    ] = Kind.COPTER,
     again: Annotated[bool, typer.Option("--again", help="Also fly cells that have a result.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the place and of the noise.")] = 1,
     model: Annotated[
@@ -42,7 +46,11 @@ def chaos(
     from terrafix_lab.faults.table import FAULTS, MATRIX
 
     faults = [f for f in FAULTS.values() if any(f.name.startswith(name) for name in fault)] if fault else [*MATRIX]
-    phases = [p for p in Phase if (not phase or p.value in phase) and not (flight and p is Phase.LANDING)]
+    phases = [
+        p
+        for p in Phase
+        if (not phase or p.value in phase) and not ((flight or vehicle is Kind.PLANE) and p is Phase.LANDING)
+    ]
     if not faults or not phases:
         raise UsageError("no such fault or phase; 'terrafix chaos --list' names them")
     if list_only:
@@ -64,7 +72,11 @@ def chaos(
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
     results = Results(out / "results.json")
-    scene = scene_in(out / f"flight-{seed}", seed) if flight is None else recorded_scene(flight, map_path, out)
+    scene = (
+        scene_in(out / (f"flight-{seed}" if vehicle is Kind.COPTER else f"{vehicle}-{seed}"), seed, vehicle)
+        if flight is None
+        else recorded_scene(flight, map_path, out)
+    )
     cells = [(f, p) for p in phases for f in faults if again or not results.has(f, p)]
     for outcome in fly_matrix(scene, cells, out, results, seed=seed, model=model or _fetched_model()):
         typer.echo(line(outcome))

@@ -10,21 +10,17 @@ from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.sources.description import camera_of, read_description
 from terrafix.vision.sources.table import Row, read_table
-from terrafix_lab.chaos.scene import LEAD_S, STRAIGHT_RADPS, Scene, middle_of_longest
-from terrafix_lab.faults.fault import Phase
-from terrafix_lab.sim.autopilot.course import Course, PeerState, read_course, write_course
+from terrafix_lab.chaos.scene import ChaosScene, phases_in_the_air
+from terrafix_lab.sim.autopilot.course import PeerState, read_course, write_course
 from terrafix_tools.evaluate import Truth, read_truth, truth_sigma_of
 from terrafix_tools.flight_map import package_of
 
-STEP_S = 0.1  # at which the course is searched for turns
-
 SMOOTHING_S = 2.5  # of the velocity: the truth of a flight is good to metres, and the autopilot's EKF to decimetres
 UNEVEN = 0.1  # share of the period by which images of an even rate may be off
-AFTER_S = 25.0  # of the flight that must be left after a fault
 ATTITUDE_SIGMA_DEG = 5.0  # of roll and pitch where none were recorded: the course is level [measured: docs/faults.md]
 
 
-def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> Scene:
+def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> ChaosScene:
     """``flight``: folder with flight.toml, frames.csv, JPEG frames and truth.csv; ``map_path``: None for the one that
     it names. Its course is written into ``folder``. Raises SourceError, EvaluationError, MapError, OutputError."""
     description = read_description(flight / "flight.toml")
@@ -44,31 +40,17 @@ def recorded_scene(flight: Path, map_path: Path | None, folder: Path) -> Scene:
     write_course(course_csv, zip(times_s.tolist(), states, strict=True))
     course = read_course(course_csv)
     has_attitude = all(row.state is not None and row.state.roll_rad is not None for row in rows)
-    return Scene(
+    return ChaosScene(
         map_path=package_of(map_path or (flight / description.map).resolve(), progress=True),
         jpegs=jpegs,
         course=course,
-        at_s=recorded_phases(course, float(times_s[-1])),
+        at_s=phases_in_the_air(course, float(times_s[-1])),
         duration_s=float(times_s[-1]),
         camera=camera_of(flight / "flight.toml", description),
         frame_hz=_rate_hz(flight, times_s),
         truth_sigma_m=truth_sigma_of(flight / "truth.csv") or 0.0,
         attitude_sigma_deg=None if has_attitude else ATTITUDE_SIGMA_DEG,
     )
-
-
-def recorded_phases(course: Course, duration_s: float) -> dict[Phase, float]:
-    """Times of the faults of a flight that begins and ends in the air, so without a landing. Raises SourceError."""
-    times = np.arange(0.0, duration_s, STEP_S)
-    yaw_rad = np.unwrap([course(t_s).yaw_rad for t_s in times.tolist()])
-    turn_radps = np.abs(np.gradient(yaw_rad, STEP_S))
-    usable = (times > LEAD_S) & (times < duration_s - AFTER_S)
-    straight = usable & (turn_radps < STRAIGHT_RADPS)
-    if not straight.any():
-        raise SourceError(f"the flight has no straight part between {LEAD_S:g} s and {AFTER_S:g} s before its end")
-    cruise_s = middle_of_longest(times, straight)
-    turn_s = float(times[np.argmax(np.where(usable, turn_radps, -1.0))])
-    return {Phase.START: cruise_s, Phase.CRUISE: cruise_s, Phase.TURN: turn_s, Phase.DARK: cruise_s}
 
 
 def _states(

@@ -16,14 +16,13 @@ from terrafix.runtime.run_dir import PREFIX, SHM, write_atomic
 from terrafix_lab.chaos.camera import StreamedCamera, camera_toml
 from terrafix_lab.chaos.console import Console
 from terrafix_lab.chaos.memory_group import MemoryGroup
-from terrafix_lab.chaos.scene import Scene
+from terrafix_lab.chaos.scene import ChaosScene
 from terrafix_lab.chaos.serial_line import SerialLine
 from terrafix_lab.chaos.switches import Switches
 from terrafix_lab.faults.edits import OriginEdit, unchanged_origin
 from terrafix_lab.faults.fault import Need
 from terrafix_lab.faults.processes import COOL_MC, SUPERVISOR
 from terrafix_lab.sim.autopilot.course import PeerState
-from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.autopilot.peer import AutopilotPeer
 from terrafix_lab.sim.camera.stream import FrameStream
 from terrafix_tools import child_process
@@ -41,7 +40,7 @@ class Rig:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: ChaosScene,
         folder: Path,
         start_s: float,
         *,
@@ -64,7 +63,7 @@ class Rig:
         self.out.mkdir()
         self.map_path.write_bytes(scene.map_path.read_bytes())
         self.set_temperature(COOL_MC)
-        self.peer: AutopilotPeer = AutopilotPeer(seed=seed, kind=Kind.COPTER, home_amsl_m=self._home_amsl_m())
+        self.peer: AutopilotPeer = AutopilotPeer(seed=seed, kind=scene.kind, home_amsl_m=self._home_amsl_m())
         self.stream = FrameStream()
         self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s, scene.frame_hz)
         self.switches = Switches(folder / "switches")

@@ -16,7 +16,7 @@ from terrafix.messages import GpsInput
 from terrafix.recorder.reader import read_flight
 from terrafix_lab.chaos import verdict as judge
 from terrafix_lab.chaos.rig import NONE, Rig
-from terrafix_lab.chaos.scene import LEAD_S, Scene
+from terrafix_lab.chaos.scene import LEAD_S, ChaosScene
 from terrafix_lab.chaos.verdict import Outcome
 from terrafix_lab.faults.edits import EVER, Span, unchanged, unchanged_origin
 from terrafix_lab.faults.fault import ROOT, Fault, Need, Phase, Process
@@ -34,7 +34,7 @@ FIRST_FIX_LIMIT_S = 20.0  # beyond the planned time of the fault, on a busy comp
 NOT_HERE = "not measurable here"
 
 
-def fly_cell(scene: Scene, fault: Fault, phase: Phase, folder: Path, *, seed: int, model: Path = NONE) -> Outcome:
+def fly_cell(scene: ChaosScene, fault: Fault, phase: Phase, folder: Path, *, seed: int, model: Path = NONE) -> Outcome:
     """Flies one cell in ``folder``, a new one that is removed if all was well. Raises SourceError, OutputError."""
     missing = missing_here(fault, model)
     if missing:
@@ -205,7 +205,7 @@ class Results:
 
 
 def fly_matrix(
-    scene: Scene, cells: Iterable[tuple[Fault, Phase]], out: Path, results: Results, *, seed: int, model: Path
+    scene: ChaosScene, cells: Iterable[tuple[Fault, Phase]], out: Path, results: Results, *, seed: int, model: Path
 ) -> Iterable[Outcome]:
     """Flies the cells that are not among the results, and yields their outcomes."""
     for fault, phase in cells:

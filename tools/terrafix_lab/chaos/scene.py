@@ -21,15 +21,17 @@ from terrafix_tools.mission.items import Do, Item, Mission
 AGL_M = 100.0
 LEG_M = 250.0  # of the two legs, east and then north
 WAY = ((LEG_M, 0.0), (LEG_M, LEG_M))
+PLANE_S = 150.0  # that a plane flies
 STEP_S = 0.1  # of the course
 CRUISE_SHARE = 0.95  # of the greatest height
 STRAIGHT_RADPS = 0.05  # a turn is faster
+AFTER_S = 25.0  # of a flight without a landing that must be left after a fault
 LEAD_S = 12.0  # flown before the fault, for the first fixes
 COURSE = "course.csv"
 
 
 @dataclass(frozen=True)
-class Scene:
+class ChaosScene:
     """``at_s``: seconds of the flight at which the fault of each phase begins. ``truth_sigma_m``: of the course.
     ``attitude_sigma_deg``: of roll and pitch that are reported; None: the default."""
 
@@ -42,6 +44,7 @@ class Scene:
     frame_hz: float = FRAME_HZ
     truth_sigma_m: float = 0.0
     attitude_sigma_deg: float | None = None
+    kind: Kind = Kind.COPTER
 
     def jpeg(self, t_s: float) -> bytes:
         """The image whose exposure is nearest to a time of the flight."""
@@ -49,19 +52,23 @@ class Scene:
         return self.jpegs[index].read_bytes()
 
 
-def scene_in(folder: Path, seed: int) -> Scene:
-    """The flight in ``folder``, which is generated if it is not there. Raises OutputError, SourceError."""
+def scene_in(folder: Path, seed: int, kind: Kind = Kind.COPTER) -> ChaosScene:
+    """The flight in ``folder``, which is generated if it is not there: of a copter from ground to ground, or of a plane
+    in the air. Raises OutputError, SourceError."""
     if not (folder / COURSE).exists():
-        mission = folder.with_suffix(".waypoints")
-        write_mission(mission, mission_along("two legs", seed, WAY))
-        flight = make(folder, FlightOptions(seed=seed, vehicle=Kind.COPTER, mission=mission), progress=False)
-        course_of(flight, folder)
+        wanted = FlightOptions(seed=seed, vehicle=kind, duration_s=PLANE_S)
+        if kind is Kind.COPTER:
+            mission = folder.with_suffix(".waypoints")
+            write_mission(mission, mission_along("two legs", seed, WAY))
+            wanted = FlightOptions(seed=seed, mission=mission, vehicle=kind)
+        course_of(make(folder, wanted, progress=False), folder)
     course = read_course(folder / COURSE)
     jpegs = sorted((folder / "frames").glob("*.jpg"))
     if not jpegs:
         raise SourceError(f"{folder}: has no images; remove it, and it is generated anew")
     duration_s = len(jpegs) / FRAME_HZ
-    return Scene(folder / MAP_NAME, jpegs, course, phases(course, duration_s), duration_s)
+    at_s = phases(course, duration_s) if kind is Kind.COPTER else phases_in_the_air(course, duration_s)
+    return ChaosScene(folder / MAP_NAME, jpegs, course, at_s, duration_s, kind=kind)
 
 
 def course_of(flight: Flight, folder: Path) -> Course:
@@ -110,6 +117,20 @@ def phases(course: Course, duration_s: float) -> dict[Phase, float]:
         Phase.DARK: cruise_s,
         Phase.LANDING: landing_s,
     }
+
+
+def phases_in_the_air(course: Course, duration_s: float) -> dict[Phase, float]:
+    """Times of the faults of a flight that begins and ends in the air, so without a landing. Raises SourceError."""
+    times = np.arange(0.0, duration_s, STEP_S)
+    yaw_rad = np.unwrap([course(t_s).yaw_rad for t_s in times.tolist()])
+    turn_radps = np.abs(np.gradient(yaw_rad, STEP_S))
+    usable = (times > LEAD_S) & (times < duration_s - AFTER_S)
+    straight = usable & (turn_radps < STRAIGHT_RADPS)
+    if not straight.any():
+        raise SourceError(f"the flight has no straight part between {LEAD_S:g} s and {AFTER_S:g} s before its end")
+    cruise_s = middle_of_longest(times, straight)
+    turn_s = float(times[np.argmax(np.where(usable, turn_radps, -1.0))])
+    return {Phase.START: cruise_s, Phase.CRUISE: cruise_s, Phase.TURN: turn_s, Phase.DARK: cruise_s}
 
 
 def middle_of_longest(times: np.ndarray, chosen: np.ndarray) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from terrafix.core.errors import OutputError
-from terrafix_lab.chaos.scene import COURSE, LEG_M, Scene, course_of, mission_along
+from terrafix_lab.chaos.scene import COURSE, LEG_M, ChaosScene, course_of, mission_along
 from terrafix_lab.sim.autopilot.course import read_course
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights.folder import FRAME_HZ, Flight, flight_over, write_flight
@@ -25,7 +25,7 @@ AFTER_STEPS = round(0.2 / STEP_S)  # of the next lap: the course has a row at th
 Heights = Callable[[np.ndarray, np.ndarray], np.ndarray]  # east, north [m] (1, N) -> ground, metres AMSL (1, N)
 
 
-def shuttle_in(out: Path, seed: int) -> Scene:
+def shuttle_in(out: Path, seed: int) -> ChaosScene:
     """The endless scene of the flight in ``out``, which is generated if it is not there. Raises OutputError (``out``
     has a run already), SourceError."""
     if (out / RUN).exists():
@@ -37,7 +37,7 @@ def shuttle_in(out: Path, seed: int) -> Scene:
 
 
 @dataclass(frozen=True)
-class EndlessScene(Scene):
+class EndlessScene(ChaosScene):
     """A scene that begins anew after its last image. No image comes twice within a lap: a vehicle in the air never has
     the very same view again, and images that repeat one of the last 40 are a stale buffer (vision)."""
 
@@ -45,7 +45,7 @@ class EndlessScene(Scene):
         return self.jpegs[round(t_s * self.frame_hz) % len(self.jpegs)].read_bytes()
 
 
-def endless(folder: Path) -> Scene:
+def endless(folder: Path) -> ChaosScene:
     """The lap in ``folder`` (images, map, course) again and again. Raises SourceError."""
     course, jpegs = read_course(folder / COURSE), sorted((folder / "frames").glob("*.jpg"))
     lap_s = len(jpegs) / FRAME_HZ

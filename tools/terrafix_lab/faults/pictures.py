@@ -17,6 +17,7 @@ NOISE_GREY = 2.0  # 1-sigma of a picture's noise from frame to frame, grey value
 FOREIGN_LAG_S = 25.0  # longer than the span of a lie in the closed loop: no picture comes from the span itself
 EXPOSURE_GAIN, EXPOSURE_OFFSET = 6.0, 60.0  # of an overexposed image: all but the darkest ground is white
 DEFOCUS_PX = 12.0  # 1-sigma of the blur
+JITTER_PX = 0.4  # of a picture that stands still, as of an encoder
 SEED = 1  # of noise
 
 
@@ -137,6 +138,38 @@ def stale_buffers(span: Span, buffers: int, *, noise_grey: float = NOISE_GREY, s
 def frozen(span: Span) -> Edit:
     """In ``span`` the camera repeats the last picture before it."""
     return stale_buffers(span, 1, noise_grey=0.0)
+
+
+def jittering(span: Span) -> Edit:
+    """In ``span`` the camera repeats the last picture before it, each time moved by JITTER_PX (1-sigma, each axis)."""
+
+    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
+        rng = np.random.default_rng([SEED, 74])
+        for shot in frozen(span)(shots):
+            if shot.image is None or not span.has(shot.frame.t_ns / 1e9):
+                yield shot
+                continue
+            height, width = shot.image.shape[:2]
+            moved = np.column_stack([np.eye(2), rng.normal(0.0, JITTER_PX, 2)])
+            image = cv2.warpAffine(shot.image, moved, (width, height), borderMode=cv2.BORDER_REFLECT)
+            yield replace(shot, image=np.asarray(image))
+
+    return edit
+
+
+def zooming(span: Span, factor: float) -> Edit:
+    """In ``span`` the focal length grows evenly to ``factor`` times that of the description."""
+
+    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
+        for shot in shots:
+            share = (shot.frame.t_ns / 1e9 - span.from_s) / (span.to_s - span.from_s)
+            if shot.image is None or not 0.0 < share <= 1.0:
+                yield shot
+                continue
+            scale = 1.0 + share * (factor - 1.0)
+            yield replace(shot, image=scaled(scale, scale)(shot.image))
+
+    return edit
 
 
 def taken_at(taken_s: Callable[[float], float]) -> Edit:

@@ -223,6 +223,27 @@ MATCHES = (
         matches=outliers,
     ),
 )
+STREAMED = (  # as a stream or its receiver fails in flight
+    Fault(
+        "pictures 1.4 s late at once",
+        "For 20 s every picture is 1.4 s old when it gets its time.",
+        20.0,
+        lambda span: during(span, pictures.late_pictures(1.4)),
+    ),
+    Fault(
+        "frozen picture that jitters",
+        "The camera repeats one picture for 15 s, each time moved by 0.4 px.",
+        FROZEN_S,
+        pictures.jittering,
+        needs=PIXELS,
+    ),
+    Fault(
+        "zoom that creeps",
+        "For 20 s the focal length grows to 1.3 times that of the description.",
+        20.0,
+        partial(pictures.zooming, factor=1.3),
+    ),
+)
 INPUTS = {fault.name: fault for fault in (*CAMERA, *FALSE_INPUTS)}
 SCENARIOS: tuple[Fault, ...] = (  # of several faults
     in_turn(
@@ -234,7 +255,8 @@ SCENARIOS: tuple[Fault, ...] = (  # of several faults
 )
 MATRIX = (NONE, *KILLED_AND_LIMITED, *CAMERA, *AROUND_THEM)  # what `terrafix chaos` flies if no fault is named
 FAULTS = {
-    fault.name: fault for fault in (*MATRIX, *FALSE_INPUTS, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *MATCHES, *SCENARIOS)
+    fault.name: fault
+    for fault in (*MATRIX, *FALSE_INPUTS, *STREAMED, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *MATCHES, *SCENARIOS)
 }
 
 

@@ -6,7 +6,7 @@ import sqlite3
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -25,7 +25,7 @@ from terrafix.core.mavlink.tlog import read_imu, read_tlog, record
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.node import LinkNode
 from terrafix.map.package import MapPackage
-from terrafix.messages import Camera, Frame, Message, Origin, StatusText
+from terrafix.messages import Camera, Frame, Origin, StatusText
 from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import ReadResult, read_received
 from terrafix.recorder.writer import FlightWriter
@@ -40,6 +40,7 @@ from terrafix_lab.sim.autopilot.fuzz_wire import UNIX_NS, FuzzedAutopilot
 from terrafix_lab.sim.autopilot.wire import heartbeat
 from terrafix_lab.sim.closed_loop.loopback import Loopback
 from terrafix_tools.autopilot_log.read import read_autopilot_log
+from terrafix_tools.in_process import InProcessShell
 from terrafix_tools.mapping.area.files import read_area
 from terrafix_tools.mapping.datum import crs_of
 from terrafix_tools.mapping.package.height_values import height_statement, heights_of
@@ -227,19 +228,12 @@ def _read_log(path: Path) -> None:
 
 def _receive(data: bytes) -> None:
     """MAVLink bytes through the edge and the node of the link."""
-    loopback, node = Loopback(), LinkNode(10.0)
+    loopback = Loopback()
     edge = MavlinkEdge(LinkSection(), loopback, lambda: UNIX_NS)
+    shell = InProcessShell({"link": LinkNode(10.0)}, lambda _, __: None, edges={"link": edge})
     for start in range(0, len(data), 512):
         loopback.to_companion(data[start : start + 512])
-        now_ns = 20_000_000 * (1 + start // 512)
-        for message in (*_fed(node, edge.poll(now_ns)), *node.tick(now_ns)):
-            edge.on_message(message)
-
-
-def _fed(node: LinkNode, messages: Iterable[Message]) -> Iterable[Message]:
-    for message in messages:
-        yield message
-        yield from node.on(message)
+        shell.step(20_000_000 * (1 + start // 512))
 
 
 class _Response(io.BytesIO):

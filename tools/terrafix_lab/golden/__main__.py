@@ -16,7 +16,7 @@ import msgspec
 import typer
 
 from terrafix.core.errors import OutputError, UsageError
-from terrafix_lab.golden.cases import CASES, Case
+from terrafix_lab.golden.cases import CASES, GoldenCase
 from terrafix_lab.golden.digest import Digest, References, differences
 from terrafix_lab.standalone import run_standalone
 
@@ -27,7 +27,7 @@ EXIT_DIFFERENT = 1  # exit code when a case differs
 DATA = Path(os.environ.get("TERRAFIX_DATA", "../shared/data"))
 
 
-def run_case(case: Case, data: Path, sources: Path | None = None) -> dict[str, Digest]:
+def run_case(case: GoldenCase, data: Path, sources: Path | None = None) -> dict[str, Digest]:
     """Runs one case in its own process and returns its digests. ``sources``: root of another revision. Raises
     UsageError when it fails.
     """
@@ -66,7 +66,7 @@ def write(path: Path, digests: References) -> None:
         raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another --refs") from None
 
 
-def wanted_cases(names: list[str], data: Path) -> list[Case]:
+def wanted_cases(names: list[str], data: Path) -> list[GoldenCase]:
     """Selects the cases by ``names`` (empty: all). Prints which are skipped for missing data. Raises UsageError."""
     unknown = sorted(set(names) - {case.name for case in CASES})
     if unknown:
@@ -83,7 +83,7 @@ def wanted_cases(names: list[str], data: Path) -> list[Case]:
     return cases
 
 
-def compare(cases: list[Case], data: Path, expected: References) -> int:
+def compare(cases: list[GoldenCase], data: Path, expected: References) -> int:
     """Returns the number of cases that differ."""
     different = 0
     for case in cases:
@@ -99,7 +99,7 @@ def compare(cases: list[Case], data: Path, expected: References) -> int:
     return different
 
 
-def revision_digests(revision: str, cases: list[Case], data: Path) -> References:
+def revision_digests(revision: str, cases: list[GoldenCase], data: Path) -> References:
     """Returns the digests of another revision, from its own worktree. Raises UsageError."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"

@@ -12,6 +12,7 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.node import Edge, Node, NodeContext
+from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.prior import CheckpointWriter
 from terrafix.link.node import TICK_HZ, LinkNode
 from terrafix.link.output.gps_input import encode
@@ -34,6 +35,7 @@ from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights import make as making
 from terrafix_tools.finalise.run import finalise
 from terrafix_tools.finalised import TABLE
+from terrafix_tools.in_process import InProcessShell
 from terrafix_tools.replay import MakeNodes, make_nodes, replay
 
 VILLAGE, TOWN = "flights/village-1", "flights/town-a"
@@ -46,7 +48,7 @@ DigestsOf = Callable[[Path, Path], dict[str, Digest]]  # (data folder, working f
 
 
 @dataclass(frozen=True)
-class Case:
+class GoldenCase:
     """``needs``: required files of the data folder."""
 
     name: str
@@ -88,19 +90,20 @@ def montecarlo(_: Path, __: Path) -> dict[str, Digest]:
     """Digests of every message that the estimator publishes in a round of simulated flights."""
     digests = Digests()
     for number in range(MONTECARLO_FLIGHTS):
-        flight = _DigestedRun(plan(MONTECARLO_SEED, number, fault=None, duration_s=MONTECARLO_S, lie_share=0.05))
-        flight.digests = digests
-        flight.record(refine=True)
+        drawn = plan(MONTECARLO_SEED, number, fault=None, duration_s=MONTECARLO_S, lie_share=0.05)
+        Run(drawn, _DigestedEstimator(digests)).record(refine=True)
     return digests.result()
 
 
-class _DigestedRun(Run):
-    digests: Digests
+class _DigestedEstimator(EstimatorNode):
+    def __init__(self, digests: Digests) -> None:
+        super().__init__()
+        self._digests = digests
 
-    def process(self, message: Message) -> list[Message]:
-        published = super().process(message)
+    def on(self, message: Message) -> list[Message]:
+        published = list(super().on(message))
         for one in published:
-            self.digests.take(one)
+            self._digests.take(one)
         return published
 
 
@@ -146,48 +149,54 @@ def finalised(data: Path, work: Path) -> dict[str, Digest]:
 def link(_: Path, work: Path) -> dict[str, Digest]:
     """Digests of the link on a simulated flight with ticks: GpsInput, the bytes of GPS_INPUT, texts, verdicts."""
     record = _fly(work, Kind.COPTER, 33)
-    digests, node, wire = Digests(), LinkNode(10.0), mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+    digests, wire = Digests(), mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+
+    def take(publisher: str, published: Message) -> None:
+        if publisher == "link":
+            digests.take(published)
+            if isinstance(published, GpsInput):
+                digests.take_bytes("GPS_INPUT", bytes(encode(published, 0).pack(wire)))
+
+    shell = InProcessShell({"link": LinkNode(10.0)}, take)
+    shell.feed_read("link", WallClock(t_ns=0, source="golden", unix_ns=UNIX_NS))
     tick_ns = round(1e9 / TICK_HZ)
     now_ns = 0
-    subscribed = (Origin, NavEstimate, CalibrationFault, SearchState, VehicleState)
-    outputs = [*node.on(WallClock(t_ns=0, source="golden", unix_ns=UNIX_NS))]
     for _topic, _log_ns, message in read_flight(record):
-        if not isinstance(message, subscribed):
+        if not isinstance(message, (Origin, NavEstimate, CalibrationFault, SearchState, VehicleState)):
             continue
         while now_ns + tick_ns <= message.t_ns:
             now_ns += tick_ns
-            outputs += node.tick(now_ns)
-        if isinstance(message, NavEstimate):
-            message = msgspec.structs.replace(message, emitted_at_ns=message.t_ns)
-        outputs += node.on(message)
-    for published in outputs:
-        digests.take(published)
-        if isinstance(published, GpsInput):
-            digests.take_bytes("GPS_INPUT", bytes(encode(published, 0).pack(wire)))
+            shell.tick(now_ns)
+        if isinstance(message, VehicleState):
+            shell.feed_read("link", message)
+        elif isinstance(message, NavEstimate):
+            shell.feed(msgspec.structs.replace(message, emitted_at_ns=message.t_ns))
+        else:
+            shell.feed(message)
     return digests.result()
 
 
 CASES = (
-    Case("montecarlo", montecarlo),
-    Case("copter", _simulated(Kind.COPTER, 31)),
-    Case("plane", _simulated(Kind.PLANE, 32)),
-    Case("restart in flight", _simulated(Kind.COPTER, 31, restarted)),
-    Case("link", link),
-    Case(
+    GoldenCase("montecarlo", montecarlo),
+    GoldenCase("copter", _simulated(Kind.COPTER, 31)),
+    GoldenCase("plane", _simulated(Kind.PLANE, 32)),
+    GoldenCase("restart in flight", _simulated(Kind.COPTER, 31, restarted)),
+    GoldenCase("link", link),
+    GoldenCase(
         "village-1 on 2014-01",
         _replayed(VILLAGE, "maps/village-2014-01.tif"),
         (VILLAGE, "maps/village-2014-01.tif"),
     ),
-    Case(
+    GoldenCase(
         "village-1 on 2014-03",
         _replayed(VILLAGE, "maps/village-2014-03.tif"),
         (VILLAGE, "maps/village-2014-03.tif"),
     ),
-    Case(
+    GoldenCase(
         "village-1 by XFeat",
         _replayed(VILLAGE, "maps/village-2014-01.tif", ("xfeat=models/xfeat.onnx",)),
         (VILLAGE, "maps/village-2014-01.tif", "models/xfeat.onnx"),
     ),
-    Case("town-a", _replayed(TOWN, "maps/town.tif"), (TOWN, "maps/town.tif")),
-    Case("finalise village-1", finalised, (VILLAGE, "maps/village-2014-01.tif")),
+    GoldenCase("town-a", _replayed(TOWN, "maps/town.tif"), (TOWN, "maps/town.tif")),
+    GoldenCase("finalise village-1", finalised, (VILLAGE, "maps/village-2014-01.tif")),
 )

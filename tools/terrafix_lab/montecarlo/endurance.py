@@ -16,7 +16,7 @@ from terrafix.estimator.prior import CheckpointGround, EstimatorCheckpoint, grou
 from terrafix.messages import CalibrationEstimate, MapMatch, Message, NavEstimate, Odometry, Origin
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Run
-from terrafix_lab.montecarlo.plan import FlightPlan, plan
+from terrafix_lab.montecarlo.plan import plan
 
 HOURS = 2.0
 # Until then caches, the window and the nodes for the refinement fill up: 128 nodes, at least ten frames apart.
@@ -27,22 +27,23 @@ TIME_SHARE_PER_H = 0.01  # largest growth per hour, share of the time for one fr
 MEMORY_MB_PER_H = 2.0  # largest growth
 
 
-class RestartComparison(Run):
-    """A run with a second estimator from ``young_from_s`` on. ``frames_ms``: processor time [ms] of the old and of the
-    young estimator, (2,) for each frame from then on."""
+class RestartComparison(EstimatorNode):
+    """With a second estimator from ``young_from_s`` on. ``frames_ms``: processor time [ms] of the old and of the young
+    estimator, (2,) for each frame from then on."""
 
-    def __init__(self, flight: FlightPlan, young_from_s: float) -> None:
-        super().__init__(flight)
+    def __init__(self, young_from_s: float) -> None:
+        super().__init__()
         self.frames_ms: list[np.ndarray] = []
         self._from_ns = round(young_from_s * 1e9)
-        self._young: EstimatorNode | None = None
-        self._origin: Origin | None = None
+        self.young: EstimatorNode | None = None
+        self._first: Origin | None = None
         self._calibration: CalibrationEstimate | None = None
         self._ground: CheckpointGround | None = None
 
-    def process(self, message: Message) -> list[Message]:
-        if self._young is None:
-            published = super().process(message)
+    def on(self, message: Message) -> list[Message]:
+        old_on, young = super().on, self.young
+        if young is None:
+            published = list(old_on(message))
             self._update_checkpoint([message, *published])
             return published
         if isinstance(message, Odometry):
@@ -52,7 +53,7 @@ class RestartComparison(Run):
         # The first of the two runs with cold caches: the order alternates.
         for i in (0, 1) if len(self.frames_ms) % 2 else (1, 0):
             start_s = time.process_time()
-            output = list(self._young.on(message)) if i else super().process(message)
+            output = list(young.on(message) if i else old_on(message))
             spent_ms[i] += 1e3 * (time.process_time() - start_s)
             published = published if i else output
         return published
@@ -62,14 +63,14 @@ class RestartComparison(Run):
         for message in messages:
             match message:
                 case Origin():
-                    self._origin = message
+                    self._first = message
                 case CalibrationEstimate():
                     self._calibration = message
                 case MapMatch():
                     self._ground = ground_of(message) or self._ground
-                case NavEstimate() if message.t_ns >= self._from_ns and self._origin is not None:
-                    self._young = EstimatorNode(0, EstimatorCheckpoint(message, self._calibration, self._ground))
-                    list(self._young.on(self._origin))
+                case NavEstimate() if message.t_ns >= self._from_ns and self._first is not None:
+                    self.young = EstimatorNode(0, EstimatorCheckpoint(message, self._calibration, self._ground))
+                    list(self.young.on(self._first))
                     return
                 case _:
                     pass
@@ -77,10 +78,11 @@ class RestartComparison(Run):
 
 def endurance(seed: int) -> dict[str, Any]:
     """Flies for HOURS without the refinement after landing. -> ``slopes``, which are printed as well."""
-    flight = RestartComparison(plan(seed, 0, fault=DrawnFault.NONE, duration_s=3600.0 * HOURS), YOUNG_FROM_S)
+    estimators = RestartComparison(YOUNG_FROM_S)
+    flight = Run(plan(seed, 0, fault=DrawnFault.NONE, duration_s=3600.0 * HOURS), estimators)
     record = flight.record(refine=False)
     alone = (record.t_s >= SETTLED_S) & (record.t_s < YOUNG_FROM_S)
-    compared = np.array(flight.frames_ms)[-int((record.t_s >= YOUNG_FROM_S + SETTLED_S).sum()) :]
+    compared = np.array(estimators.frames_ms)[-int((record.t_s >= YOUNG_FROM_S + SETTLED_S).sum()) :]
     result = slopes(record.t_s[alone], record.memory_mb[alone], compared, YOUNG_FROM_S / 3600.0)
     Console().print(
         f"{HOURS:g} h: {result['cpu_ms']:.1f} ms of processor time a frame, {100 * result['cpu_share_per_h']:+.2f} "

@@ -1,9 +1,8 @@
-"""One flight of the run: messages into the real EstimatorNode, in the order of the in-process executor."""
+"""One flight of the run: messages into the real estimator and smoother."""
 
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.node import Node
 from terrafix.core.pose import log_so3
 from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import (
@@ -19,7 +19,6 @@ from terrafix.messages import (
     MeasurementVerdict,
     Message,
     NavEstimate,
-    Origin,
     Prediction,
     Refinement,
     SourceEnded,
@@ -34,11 +33,12 @@ from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.faults import Faults
 from terrafix_lab.montecarlo.flown import Shot, fly
 from terrafix_lab.montecarlo.ground import MapError, Terrain
-from terrafix_lab.montecarlo.lens import Lens
+from terrafix_lab.montecarlo.lens import TrueLens
 from terrafix_lab.montecarlo.lies import FindMatch, Lies
 from terrafix_lab.montecarlo.matches import MapMatches
 from terrafix_lab.montecarlo.plan import FlightPlan
 from terrafix_lab.montecarlo.sightings import SimulatedOdometry
+from terrafix_tools.in_process import InProcessShell
 
 
 @dataclass
@@ -73,15 +73,35 @@ def run(plan: FlightPlan, *, refine: bool = True) -> Record:
     return Run(plan).record(refine)
 
 
+class MeasuredNode:
+    """A node with the processor time that it has taken."""
+
+    def __init__(self, node: Node) -> None:
+        self._node, self.cpu_s = node, 0.0
+
+    def on(self, message: Message) -> list[Message]:
+        began_s = time.process_time()
+        published = list(self._node.on(message))
+        self.cpu_s += time.process_time() - began_s
+        return published
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        return self._node.tick(now_ns)
+
+
 class Run:
-    def __init__(self, plan: FlightPlan) -> None:
+    def __init__(self, plan: FlightPlan, estimator: EstimatorNode | None = None) -> None:
+        """``estimator``: another than the usual one."""
         flown = fly(plan, Terrain(plan.seed, plan.hills_m, plan.settled))
         self._edit_match: MatchEdit = lambda match, _prediction: match
         if not isinstance(plan.fault, DrawnFault):
             fault = FAULTS[plan.fault]
             flown, self._edit_match = edited(flown, fault), fault.matches() if fault.matches else self._edit_match
-        self._plan, self._flown = plan, flown
-        self._node, self._smoother = EstimatorNode(), SmootherNode()
+        self._plan, self.flown = plan, flown
+        self._node = estimator or EstimatorNode()
+        self._estimator, self._smoother = MeasuredNode(self._node), MeasuredNode(SmootherNode())
+        self._shell = InProcessShell({"estimator": self._estimator, "smoother": self._smoother}, self._record_message)
+        self._predictions: list[Prediction] = []  # since the last odometry
         self._frame = LocalFrame(flown.origin.lat_deg, flown.origin.lon_deg)
         self._times_ns: dict[int, int] = {}  # frame -> time of its newest estimate
         self._page_mb = os.sysconf("SC_PAGE_SIZE") / 2**20
@@ -105,12 +125,12 @@ class Run:
         )
 
     def record(self, refine: bool) -> Record:
-        plan, flown, record = self._plan, self._flown, self._record
+        plan, flown, record = self._plan, self.flown, self._record
         described = flown.origin.camera
         focal_error = plan.focal_error
         if described.fx != plan.camera.fx:
             focal_error = (1.0 + focal_error) * plan.camera.fx / described.fx - 1.0
-        lens = Lens(CameraCalibration.of(described), focal_error, plan.k1_error)
+        lens = TrueLens(CameraCalibration.of(described), focal_error, plan.k1_error)
         sightings = SimulatedOdometry(lens, flown.terrain, plan.seed)
         matches = MapMatches(
             lens,
@@ -122,89 +142,65 @@ class Run:
         )
         faults, lies = Faults(plan.fault, plan.duration_s, plan.seed), Lies(plan, flown)
         record.lie = lies.span()
-        self._send(flown.origin)
+        self._shell.feed(flown.origin)
         late: list[tuple[int, MapMatch]] = []  # frame at which it is published
         for i, shot in enumerate(flown.frames):
             picture = lies.picture(i)
             odometry = sightings.odometry(i, picture, blind=picture.dark or faults.is_blacked_out(shot.t_s))
-            with self._stopwatch(record.cpu_ms, i):
-                for state in flown.telemetry[i]:
-                    self._send(state)
-                published = self._send(odometry)
+            began_s = self._estimator.cpu_s
+            self._predictions.clear()
+            for message in (*flown.telemetry[i], odometry):
+                self._shell.feed(message)
             find = find_match(matches, faults, shot.t_s, dark=picture.dark)
             late += [
                 (
                     i + faults.late_frames(),
                     faults.alter(self._edit_match(lies.match(i, prediction, find), prediction), shot),
                 )
-                for prediction in published
-                if isinstance(prediction, Prediction)
+                for prediction in self._predictions
             ]
-            with self._stopwatch(record.cpu_ms, i):
-                for due, match in late:
-                    if due <= i:
-                        self._send(match)
+            for due, match in late:
+                if due <= i:
+                    self._shell.feed(match)
+            record.cpu_ms[i] = 1e3 * (self._estimator.cpu_s - began_s)
             late = [(due, match) for due, match in late if due > i]
             record.memory_mb[i] = self._page_mb * int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         if refine:
-            refine_ms = np.zeros(1)
-            with self._stopwatch(refine_ms, 0):
-                self._send(SourceEnded(t_ns=round(flown.frames[-1].t_s * 1e9), frames=len(flown.frames)))
-            record.refine_cpu_s = 1e-3 * float(refine_ms[0])
+            began_s = self._estimator.cpu_s
+            self._shell.feed(SourceEnded(t_ns=round(flown.frames[-1].t_s * 1e9), frames=len(flown.frames)))
+            record.refine_cpu_s = self._estimator.cpu_s - began_s
+        record.smoother_cpu_s = self._smoother.cpu_s
         estimator = self._node.estimator  # no message has this number
         record.rebuilds = estimator.graph.rebuilds if estimator is not None else 0
         return record
 
-    @contextmanager
-    def _stopwatch(self, into_ms: np.ndarray, i: int) -> Iterator[None]:
-        """Adds the processor time of the block to ``into_ms[i]``."""
-        start_s = time.process_time()
-        yield
-        into_ms[i] += 1e3 * (time.process_time() - start_s)
-
-    def process(self, message: Message) -> list[Message]:
-        """-> the messages that the estimator publishes."""
-        return list(self._node.on(message))
-
-    def _send(self, message: Message) -> list[Message]:
-        """Processes ``message`` and records what is published, which is returned."""
-        published = self.process(message)
-        for given in (message, *published) if isinstance(message, Origin) else published:
-            self._record_smoothed(given)
-        for answer in published:
-            match answer:
-                case NavEstimate():
-                    self._record_estimate(answer)
-                case MeasurementVerdict(measurement="map"):
-                    fixes = self._record.fixes
-                    fixes[str(answer.verdict)] = fixes.get(str(answer.verdict), 0) + 1
-                    restarted = answer.verdict is Verdict.ACCEPTED and answer.detail.startswith("restarted")
-                    self._record.restarts += restarted
-                case Refinement():
-                    for pose in answer.poses:
-                        at = self._frame.to_local(pose.lat_deg, pose.lon_deg)
-                        truth_m = self._truth(pose.frame_id).p_m[:2]
-                        self._record.refined_error_m[pose.frame_id] = np.array(at) - truth_m
-                        self._record.refined_sigma_m[pose.frame_id] = pose.sigma_e_m, pose.sigma_n_m
-        return published
-
-    def _record_smoothed(self, message: Message) -> None:
-        """What the smoother refines after ``message``. Its time is not the estimator's."""
-        began_s, record = time.process_time(), self._record
-        for answer in self._smoother.on(message):
-            if isinstance(answer, Refinement):
-                for pose in answer.poses:
+    def _record_message(self, publisher: str, message: Message) -> None:
+        record = self._record
+        match message:
+            case Prediction():
+                self._predictions.append(message)
+            case NavEstimate():
+                self._record_estimate(message)
+            case MeasurementVerdict(measurement="map"):
+                record.fixes[str(message.verdict)] = record.fixes.get(str(message.verdict), 0) + 1
+                record.restarts += message.verdict is Verdict.ACCEPTED and message.detail.startswith("restarted")
+            case Refinement():
+                for pose in message.poses:
                     at = self._frame.to_local(pose.lat_deg, pose.lon_deg)
-                    record.smoothed_error_m[pose.frame_id] = np.array(at) - self._truth(pose.frame_id).p_m[:2]
-                    (e2, n2), en = np.square([pose.sigma_e_m, pose.sigma_n_m]), pose.cov_en_m2
-                    record.smoothed_cov[pose.frame_id] = [[e2, en], [en, n2]]
-        record.smoother_cpu_s += time.process_time() - began_s
+                    error_m = np.array(at) - self._truth(pose.frame_id).p_m[:2]
+                    if publisher == "smoother":
+                        (e2, n2), en = np.square([pose.sigma_e_m, pose.sigma_n_m]), pose.cov_en_m2
+                        record.smoothed_error_m[pose.frame_id] = error_m
+                        record.smoothed_cov[pose.frame_id] = [[e2, en], [en, n2]]
+                    else:
+                        record.refined_error_m[pose.frame_id] = error_m
+                        record.refined_sigma_m[pose.frame_id] = pose.sigma_e_m, pose.sigma_n_m
 
     def _truth(self, frame_id: int) -> Shot:
         """At the time of the newest estimate of the frame. That is earlier than the frame's time stamp if the estimator
         corrects a time offset of the camera."""
-        shot, t_ns = self._flown.frames[frame_id], self._times_ns[frame_id]
-        return shot if round(shot.t_s * 1e9) == t_ns else self._flown.at(t_ns * 1e-9)
+        shot, t_ns = self.flown.frames[frame_id], self._times_ns[frame_id]
+        return shot if round(shot.t_s * 1e9) == t_ns else self.flown.at(t_ns * 1e-9)
 
     def _record_estimate(self, estimate: NavEstimate) -> None:
         i, record = estimate.frame_id, self._record

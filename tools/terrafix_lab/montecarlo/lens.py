@@ -10,7 +10,7 @@ from terrafix.messages import Camera
 
 
 @dataclass(frozen=True)
-class Lens:
+class TrueLens:
     """The true camera. ``described``: its stated calibration. ``focal``: relative error of the focal length; ``k1``:
     error of the first radial coefficient."""
 
@@ -33,11 +33,11 @@ class Lens:
             xy = distorted / (1.0 + self.k1 * (xy**2).sum(axis=1, keepdims=True))
         return np.column_stack([xy, np.ones(len(xy))])
 
-    def showing(self, scale: tuple[float, float]) -> "Lens":
+    def showing(self, scale: tuple[float, float]) -> "TrueLens":
         return replace(self, scale=scale)
 
-    def scaled(self, factor: float) -> "Lens":
-        return Lens(self.described.scaled(factor), self.focal, self.k1)
+    def scaled(self, factor: float) -> "TrueLens":
+        return TrueLens(self.described.scaled(factor), self.focal, self.k1)
 
 
 def footprint_m(camera: Camera | CameraCalibration, agl_m: float) -> float:

@@ -27,7 +27,7 @@ from terrafix.core.pose import log_so3
 from terrafix.messages import GroundPlane, MapMatch, MatchPlace, PnpInput, Prediction, Verdict
 from terrafix_lab.montecarlo.flown import Shot
 from terrafix_lab.montecarlo.ground import MAP_SEES_TOPS, MapError, Terrain
-from terrafix_lab.montecarlo.lens import Lens, footprint_m
+from terrafix_lab.montecarlo.lens import TrueLens, footprint_m
 from terrafix_lab.montecarlo.tracked_belief import TrackedBelief
 
 FOUND_SHARE = (0.4, 0.9)  # of the patches that are found, on poor and on good ground ...
@@ -47,7 +47,7 @@ class MapMatches:
     """Call ``match`` for every Prediction, with the true pose of its frame."""
 
     def __init__(
-        self, lens: Lens, terrain: Terrain, error: MapError, *, has_dem: bool, map_sigma_m: float, seed: int
+        self, lens: TrueLens, terrain: Terrain, error: MapError, *, has_dem: bool, map_sigma_m: float, seed: int
     ) -> None:
         self._lens = lens
         self._terrain, self._error = terrain, error

@@ -16,7 +16,7 @@ from terrafix.vision import repeated_picture
 from terrafix.vision.two_view import RANSAC_PX, homography_inliers
 from terrafix_lab.montecarlo.flown import Shot
 from terrafix_lab.montecarlo.ground import Terrain
-from terrafix_lab.montecarlo.lens import Lens
+from terrafix_lab.montecarlo.lens import TrueLens
 from terrafix_lab.sim.true_messages import first_odometry
 
 WHITE_PX = 0.30  # 1-sigma of a tracked coordinate in one frame, white
@@ -46,7 +46,7 @@ class _Keyframe:
 class SimulatedOdometry:
     """Call ``odometry`` once for every frame, in order."""
 
-    def __init__(self, lens: Lens, terrain: Terrain, seed: int) -> None:
+    def __init__(self, lens: TrueLens, terrain: Terrain, seed: int) -> None:
         self._lens = lens.scaled(min(1.0, real.WORK_WIDTH_PX / lens.described.width))
         self._camera = self._lens.described
         self._terrain = terrain

@@ -143,6 +143,9 @@ def make(
     map_content: Annotated[
         MapContent, typer.Option(help="Map of a generated place: imagery, roads and buildings as vectors, or both.")
     ] = MapContent.IMAGERY,
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera description (any lens, any mount); default: 960x540, 81 degrees wide.")
+    ] = None,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
     """Write a flight folder of a simulated vehicle: images, telemetry.tlog, truth.csv and the map."""
@@ -163,6 +166,7 @@ def make(
         agl_m=agl,
         events=events,
         jam_after_s=jam_after,
+        camera=camera,
     )
     flight = making.make(out, wanted, progress=not quiet)
     length_m = flight.path.length_m(flight.duration_s)

@@ -36,7 +36,7 @@ class Places(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 @dataclass(frozen=True)
-class Ground:
+class TrainingGround:
     """A place at one scale. ``pictures`` (dates, 3, H, W) uint8 RGB."""
 
     name: str
@@ -61,19 +61,19 @@ def read_list(path: Path) -> list[Place]:
     return places
 
 
-def read_places(places: list[Place], folder: Path) -> list[Ground]:
+def read_places(places: list[Place], folder: Path) -> list[TrainingGround]:
     """All scale levels of all places. ``folder``: base of the image paths. Raises TrainingError."""
     return [level for place in places for level in _levels(place, folder)]
 
 
-def _levels(place: Place, folder: Path) -> list[Ground]:
+def _levels(place: Place, folder: Path) -> list[TrainingGround]:
     pictures = _crop_to_common_area([folder / name for name in place.pictures])
     if min(pictures[0].shape[:2]) < MIN_SIDE_PX:
         raise TrainingError(f"{place.name}: its images have less than {MIN_SIDE_PX} px in common; remove it")
-    levels: list[Ground] = []
+    levels: list[TrainingGround] = []
     while len(levels) < MAX_LEVELS and min(pictures[0].shape[:2]) >= MIN_SIDE_PX:
         stacked = np.stack([image[:, :, ::-1].transpose(2, 0, 1) for image in pictures])
-        levels.append(Ground(place.name, stacked))
+        levels.append(TrainingGround(place.name, stacked))
         half = pictures[0].shape[1] // 2, pictures[0].shape[0] // 2
         pictures = [cv2.resize(image, half, interpolation=cv2.INTER_AREA) for image in pictures]
     return levels

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from terrafix_lab.train.ground import Ground
+from terrafix_lab.train.ground import TrainingGround
 
 STRIDE = 8
 CAMERA_PX, MAP_PX = 256, 448
@@ -64,7 +64,7 @@ class Views:
     seen: Tensor
 
 
-def to_device(grounds: list[Ground], device: str) -> list[ImageStack]:
+def to_device(grounds: list[TrainingGround], device: str) -> list[ImageStack]:
     return [ImageStack(ground.name, torch.from_numpy(ground.pictures).to(device)) for ground in grounds]
 
 
@@ -98,7 +98,7 @@ def _sample_pair(stack: ImageStack, rng: np.random.Generator, ranges: Ranges) ->
         map_view = _sample(stack.pictures[second], grid @ onto.T + base)
         if float((map_view.amax(0) == 0).float().mean()) <= MAX_EMPTY:
             break
-    warp = Warp(rng, ranges)
+    warp = ViewWarp(rng, ranges)
     inner = pixels(CAMERA_PX, device)
     relief = _relief_displacement(rng, ranges, device)
     camera = _sample(stack.pictures[first], (warp(inner) + relief) @ onto.T + base)
@@ -113,7 +113,7 @@ def _sample_pair(stack: ImageStack, rng: np.random.Generator, ranges: Ranges) ->
     return camera, map_view, at_px, true_px, inside & ~covered
 
 
-class Warp:
+class ViewWarp:
     """Pixels relative to the centre of the camera view -> pixels relative to the centre of the ground view."""
 
     def __init__(self, rng: np.random.Generator, ranges: Ranges) -> None:

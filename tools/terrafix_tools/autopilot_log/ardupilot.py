@@ -11,23 +11,22 @@ from pathlib import Path
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
+from terrafix.core.autopilot_log.dataflash import Table, read_dataflash
 from terrafix.core.errors import SourceError
 from terrafix.link.output.odometry import ARDUPILOT_M_PER_E7
-from terrafix_tools.autopilot_log.dataflash import Table, read_dataflash
 from terrafix_tools.autopilot_log.structure import (
-    Attitude,
     AutopilotLog,
     BodyRates,
     EkfTrack,
-    Event,
     Fusion,
     GlobalTrack,
     GpsTrack,
+    LogEvent,
     Origin,
     Series,
     Steps,
     changes,
-    cleaned,
     steps,
     value_at,
 )
@@ -138,8 +137,8 @@ def read_ardupilot(path: Path) -> AutopilotLog:
 _EMPTY = Table({}, {}, np.zeros(0, int), np.zeros(0))
 
 
-def _attitude(table: Table) -> Attitude:
-    return cleaned(Attitude(table.t_s, *(np.radians(table.column(name)) for name in ("Roll", "Pitch", "Yaw"))))
+def _attitude(table: Table) -> AttitudeSeries:
+    return cleaned(AttitudeSeries(table.t_s, *(np.radians(table.column(name)) for name in ("Roll", "Pitch", "Yaw"))))
 
 
 def _rates(found: dict[str, Table]) -> BodyRates | None:
@@ -346,29 +345,31 @@ def _modes(table: Table, firmware: str) -> list[str]:
     return [mode_name(firmware, int(number)) for number in table.integers(numbers)]
 
 
-def _events(found: dict[str, Table], firmware: str) -> list[Event]:
+def _events(found: dict[str, Table], firmware: str) -> list[LogEvent]:
     events = []
     modes = found.get("MODE", _EMPTY)
     for t_s, mode in zip(modes.t_s, _modes(modes, firmware), strict=True):
-        events.append(Event(float(t_s), "mode", mode))
+        events.append(LogEvent(float(t_s), "mode", mode))
     noted = found.get("EV", _EMPTY)
     for t_s, number in zip(noted.t_s, noted.integers("Id"), strict=True):
         kind = "arming" if number in (ARMED, DISARMED) else "event"
-        events.append(Event(float(t_s), kind, _EVENTS.get(number, f"event {number}")))
+        events.append(LogEvent(float(t_s), kind, _EVENTS.get(number, f"event {number}")))
     errors = found.get("ERR", _EMPTY)
     for t_s, system, code in zip(errors.t_s, errors.integers("Subsys"), errors.integers("ECode"), strict=True):
         name = _SUBSYSTEMS.get(int(system), f"subsystem {int(system)}")
-        events.append(Event(float(t_s), "error", f"{name}: " + (f"error {int(code)}" if code else "resolved")))
+        events.append(LogEvent(float(t_s), "error", f"{name}: " + (f"error {int(code)}" if code else "resolved")))
     texts = found.get("MSG", _EMPTY)
     for t_s, text in zip(texts.t_s, texts.texts("Message"), strict=True):
-        events.append(Event(float(t_s), "message", text))
+        events.append(LogEvent(float(t_s), "message", text))
     return events
 
 
-def _used_changes(gps: list[GpsTrack]) -> list[Event]:
+def _used_changes(gps: list[GpsTrack]) -> list[LogEvent]:
     events = []
     for track in gps:
         used = None if track.used is None else steps(track.t_s, track.used.astype(float))
         for t_s, value in () if used is None else zip(used.t_s[1:], used.value[1:], strict=True):
-            events.append(Event(float(t_s), "gps", f"GPS {track.instance + 1} {'used' if value else 'no longer used'}"))
+            events.append(
+                LogEvent(float(t_s), "gps", f"GPS {track.instance + 1} {'used' if value else 'no longer used'}")
+            )
     return events

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
 from terrafix.core.errors import SourceError
 from terrafix.messages import GpsInput, Origin, PositionSource, VehicleState
 from terrafix.recorder.reader import ReadResult, check_format, read_received
-from terrafix_tools.autopilot_log.structure import Attitude, Event, cleaned
+from terrafix_tools.autopilot_log.structure import LogEvent
 
 NS = 1_000_000_000
 
@@ -31,9 +32,9 @@ class FlightSide:
 
     path: Path
     end_s: float  # of the last message
-    attitude: Attitude
+    attitude: AttitudeSeries
     sent: Sent
-    events: list[Event]  # what Terrafix did to the autopilot
+    events: list[LogEvent]  # what Terrafix did to the autopilot
     gps_id: int  # configured instance of our GPS_INPUT; 0 is the first
 
 
@@ -69,9 +70,9 @@ def read_flight_side(path: Path) -> FlightSide:
     return FlightSide(
         path=path,
         end_s=(last_ns - zero) / NS,
-        attitude=cleaned(Attitude(*_columns(attitude, 4, zero))),
+        attitude=cleaned(AttitudeSeries(*_columns(attitude, 4, zero))),
         sent=Sent(*_columns(sent, 5, zero)),
-        events=[Event((switch.t_ns - zero) / NS, "source", _switched(switch)) for switch in switches],
+        events=[LogEvent((switch.t_ns - zero) / NS, "source", _switched(switch)) for switch in switches],
         gps_id=int(result.header["config"].get("link", {}).get("gps_id", 0)),
     )
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from terrafix.core.autopilot_log.alignment import Alignment, align
 from terrafix.link.integrity.output_predictor import metres_per_degree
-from terrafix_tools.autopilot_log.alignment import Alignment, align
 from terrafix_tools.autopilot_log.flight import FlightSide, Sent
 from terrafix_tools.autopilot_log.structure import (
     AutopilotLog,

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from terrafix.core.autopilot_log.dataflash import is_dataflash
 from terrafix.core.errors import SourceError
 from terrafix.core.mavlink.tlog import is_tlog
-from terrafix_tools.autopilot_log.dataflash import is_dataflash
 from terrafix_tools.autopilot_log.structure import AutopilotLog
 
 _HEAD_BYTES = 256 * 1024  # in which a record is searched: a log may begin with lost or foreign bytes

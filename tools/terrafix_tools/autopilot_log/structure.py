@@ -12,36 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
-
-@dataclass(frozen=True)
-class Attitude:
-    """Four arrays (N,). The attitude that the autopilot flies on."""
-
-    t_s: np.ndarray
-    roll_rad: np.ndarray
-    pitch_rad: np.ndarray
-    yaw_rad: np.ndarray
-
-
-MAX_LOG_S = 86_400.0  # times further from the others are damaged [tuned]
-MAX_STEP_S = 10.0  # of one sample against its neighbours: beyond it its time is damaged [tuned]
-
-
-def cleaned(attitude: Attitude) -> Attitude:
-    """Without samples that are not finite, whose time is damaged, or that are not newer than all before them (a
-    repeated packet, a clock that was set back)."""
-    columns = (attitude.t_s, attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
-    finite = np.isfinite(np.sum(columns, axis=0))
-    t_s = attitude.t_s[finite]
-    if not t_s.size:
-        return Attitude(*(column[finite] for column in columns))
-    near = np.median(sliding_window_view(np.pad(t_s, 2, mode="edge"), 5), axis=1)
-    keep = (np.abs(t_s - near) < MAX_STEP_S) & (np.abs(t_s - np.median(t_s)) < MAX_LOG_S)
-    before = np.maximum.accumulate(np.where(keep, t_s, -np.inf))
-    keep[1:] &= t_s[1:] > before[:-1]
-    return Attitude(*(column[finite][keep] for column in columns))
+from terrafix.core.autopilot_log.attitude import AttitudeSeries
 
 
 @dataclass(frozen=True)
@@ -128,7 +100,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Event:
+class LogEvent:
     t_s: float
     kind: str  # "mode", "arming", "lane", "source set", "gps", "error", "event", "message"
     text: str
@@ -140,7 +112,7 @@ class AutopilotLog:
 
     path: Path
     kind: str  # "ArduPilot DataFlash", "MAVLink telemetry", "PX4 ULog"
-    attitude: Attitude
+    attitude: AttitudeSeries
     firmware: str = ""
     rates: BodyRates | None = None
     position: GlobalTrack | None = None
@@ -152,7 +124,7 @@ class AutopilotLog:
     source_set: Steps | None = None
     gps: list[GpsTrack] = field(default_factory=list)
     fusion: list[Fusion] = field(default_factory=list)
-    events: list[Event] = field(default_factory=list)
+    events: list[LogEvent] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)  # messages in the file, by type
     skipped_bytes: int = 0  # damaged or cut off
     notes: list[str] = field(default_factory=list)  # what was repaired, chosen and left out, in words
@@ -176,9 +148,9 @@ def value_at(found: Steps, at_s: np.ndarray) -> np.ndarray:
     return found.value[np.maximum(np.searchsorted(found.t_s, at_s, side="right") - 1, 0)]
 
 
-def changes(what: str, kind: str, found: Steps | None) -> list[Event]:
+def changes(what: str, kind: str, found: Steps | None) -> list[LogEvent]:
     """-> an event for each change after the first value: "lane 0 -> 1"."""
     if found is None:
         return []
     pairs = zip(found.t_s[1:], found.value[:-1], found.value[1:], strict=True)
-    return [Event(float(t), kind, f"{what} {old:g} -> {new:g}") for t, old, new in pairs]
+    return [LogEvent(float(t), kind, f"{what} {old:g} -> {new:g}") for t, old, new in pairs]

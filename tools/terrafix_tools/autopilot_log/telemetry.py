@@ -13,22 +13,21 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
 from terrafix.core.errors import SourceError
 from terrafix.core.mavlink.tlog import TelemetryLog
 from terrafix.core.mavlink.vehicles import PX4, firmware_of
 from terrafix_tools.autopilot_log.ardupilot import mode_name, named_firmware
 from terrafix_tools.autopilot_log.structure import (
-    Attitude,
     AutopilotLog,
     BodyRates,
     EkfTrack,
-    Event,
     Fusion,
     GlobalTrack,
     GpsTrack,
+    LogEvent,
     Origin,
     Series,
-    cleaned,
 )
 
 _WANTED = {
@@ -73,7 +72,7 @@ def read_telemetry(path: Path, system_id: int = 0) -> AutopilotLog:
         found[message.get_type()].append(((t_us - records.t0_us) * 1e-6, message))
     received = found["ATTITUDE"]
     t_s = _measured_s(received) if received else np.zeros(0)
-    attitude = cleaned(Attitude(t_s, *_columns(received, "roll", "pitch", "yaw")))
+    attitude = cleaned(AttitudeSeries(t_s, *_columns(received, "roll", "pitch", "yaw")))
     if not attitude.t_s.size:
         raise SourceError(f"{path}: holds no attitude of an autopilot (ATTITUDE); give another log")
     firmware = _firmware(found["HEARTBEAT"], found["STATUSTEXT"])
@@ -197,26 +196,26 @@ def _mode(heartbeat: Any, firmware: str) -> str:
     return _PX4_MODES.get(main, f"mode {main}.{sub}")
 
 
-def _states(timed: _Timed, firmware: str) -> Iterator[Event]:
+def _states(timed: _Timed, firmware: str) -> Iterator[LogEvent]:
     """Modes and arming, at each change."""
     mode, armed = "", False
     for t_s, heartbeat in timed:
         now_armed = bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         if (now_mode := _mode(heartbeat, firmware)) != mode:
-            yield Event(t_s, "mode", now_mode)
+            yield LogEvent(t_s, "mode", now_mode)
         if now_armed != armed:
-            yield Event(t_s, "arming", "armed" if now_armed else "disarmed")
+            yield LogEvent(t_s, "arming", "armed" if now_armed else "disarmed")
         mode, armed = now_mode, now_armed
 
 
-def _texts(timed: _Timed) -> list[Event]:
+def _texts(timed: _Timed) -> list[LogEvent]:
     """Texts of more than 50 characters come in pieces with one id."""
-    events: list[Event] = []
+    events: list[LogEvent] = []
     for t_s, message in timed:
         text = message.text if isinstance(message.text, str) else message.text.decode("utf-8", "replace")
         text = text.split("\0")[0]
         if message.id and message.chunk_seq and events:
-            events[-1] = Event(events[-1].t_s, "message", events[-1].text + text)
+            events[-1] = LogEvent(events[-1].t_s, "message", events[-1].text + text)
         else:
-            events.append(Event(t_s, "message", text))
+            events.append(LogEvent(t_s, "message", text))
     return events

@@ -34,7 +34,7 @@ class Key(NamedTuple):
     number: int  # of those with equal other fields, in the order of the record
 
 
-class Estimate(NamedTuple):
+class ComparedEstimate(NamedTuple):
     """What is compared of a NavEstimate beside its digest; the last one of a frame counts."""
 
     t_s: float
@@ -44,7 +44,7 @@ class Estimate(NamedTuple):
 
 
 @dataclass
-class Record:
+class ComparedRecord:
     """One read record: digests by key in the order of the record; times [s] since the start, and estimates, by frame;
     numbers of verdicts."""
 
@@ -53,18 +53,18 @@ class Record:
     origin: Origin
     digests: dict[Key, bytes] = field(default_factory=dict)
     frame_t_s: dict[int, float] = field(default_factory=dict)
-    estimates: dict[int, Estimate] = field(default_factory=dict)
+    estimates: dict[int, ComparedEstimate] = field(default_factory=dict)
     verdicts: Counter[tuple[str, str]] = field(default_factory=Counter)  # measurement, verdict
 
 
-def read_record(path: Path) -> Record:
+def read_record(path: Path) -> ComparedRecord:
     """Reads all messages of a record (a file, or the folder of a replay or run). Raises SourceError."""
     result = ReadResult()
-    record: Record | None = None
+    record: ComparedRecord | None = None
     for key, message in keyed(path, result):
         if record is None:
             origin = _origin_of(path)
-            record = Record(path, result, origin)
+            record = ComparedRecord(path, result, origin)
         record.digests[key] = digest(message, record.origin.t_ns)
         if key.frame_id >= 0:
             record.frame_t_s.setdefault(key.frame_id, (message.t_ns - record.origin.t_ns) / NS)
@@ -121,6 +121,6 @@ def _origin_of(path: Path) -> Origin:
     raise SourceError(f"{path}: the record has no origin of a flight; was the source of the flight opened?")
 
 
-def _estimate(message: NavEstimate, zero_ns: int) -> Estimate:
+def _estimate(message: NavEstimate, zero_ns: int) -> ComparedEstimate:
     delay_ms = (message.emitted_at_ns - message.t_ns) / 1e6
-    return Estimate((message.t_ns - zero_ns) / NS, message.lat_deg, message.lon_deg, delay_ms)
+    return ComparedEstimate((message.t_ns - zero_ns) / NS, message.lat_deg, message.lon_deg, delay_ms)

@@ -8,13 +8,13 @@ import numpy as np
 from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.recorder.reader import ReadResult
-from terrafix_tools.compare.alignment import CLOCKED, NS, Key, Record, contents, keyed
+from terrafix_tools.compare.alignment import CLOCKED, NS, ComparedRecord, Key, contents, keyed
 
 MAX_FIELDS = 8  # differing fields of a message that are listed
 SAME_START_M = 0.01  # two origins of one flight are equal but for rounding
 
 
-def compare_records(a: Record, b: Record) -> dict[str, Any]:
+def compare_records(a: ComparedRecord, b: ComparedRecord) -> dict[str, Any]:
     """-> the comparison as JSON (docs/compare.md). Raises SourceError for records of two flights."""
     _check_same_flight(a, b)
     left_out = () if a.origin.t_ns == b.origin.t_ns else tuple(kind.__name__ for kind in CLOCKED)
@@ -40,7 +40,7 @@ def compare_records(a: Record, b: Record) -> dict[str, Any]:
     }
 
 
-def distances_m(a: Record, b: Record) -> list[tuple[float, float]]:
+def distances_m(a: ComparedRecord, b: ComparedRecord) -> list[tuple[float, float]]:
     """-> (time since the start [s], horizontal distance of the two positions [m]) of each frame that both have."""
     frame = LocalFrame(a.origin.lat_deg, a.origin.lon_deg)
     found = []
@@ -52,7 +52,7 @@ def distances_m(a: Record, b: Record) -> list[tuple[float, float]]:
     return found
 
 
-def positions(a: Record, b: Record) -> dict[str, Any]:
+def positions(a: ComparedRecord, b: ComparedRecord) -> dict[str, Any]:
     """Horizontal distance of the last estimates of each frame."""
     points = distances_m(a, b)
     metres = np.array([metres for _, metres in points])
@@ -73,7 +73,7 @@ def positions(a: Record, b: Record) -> dict[str, Any]:
     return result
 
 
-def verdicts(a: Record, b: Record) -> list[dict[str, Any]]:
+def verdicts(a: ComparedRecord, b: ComparedRecord) -> list[dict[str, Any]]:
     """Number of verdicts by measurement, in both records."""
     pairs = sorted(a.verdicts.keys() | b.verdicts.keys())
     return [
@@ -82,7 +82,7 @@ def verdicts(a: Record, b: Record) -> list[dict[str, Any]]:
     ]
 
 
-def _check_same_flight(a: Record, b: Record) -> None:
+def _check_same_flight(a: ComparedRecord, b: ComparedRecord) -> None:
     frame = LocalFrame(a.origin.lat_deg, a.origin.lon_deg)
     apart_m = float(np.hypot(*frame.to_local(b.origin.lat_deg, b.origin.lon_deg)))
     if apart_m > SAME_START_M:
@@ -97,7 +97,7 @@ def _check_same_flight(a: Record, b: Record) -> None:
 
 
 def _first_by_kind(
-    a: Record, b: Record, differing: list[Key], only_a: list[Key], only_b: list[Key]
+    a: ComparedRecord, b: ComparedRecord, differing: list[Key], only_a: list[Key], only_b: list[Key]
 ) -> list[dict[str, Any]]:
     """The earliest difference of each message type, earliest first."""
     earliest: dict[str, Key] = {}
@@ -110,7 +110,7 @@ def _first_by_kind(
     return [_divergence(key, times[key], of_a.get(key), of_b.get(key)) for key in earliest.values()]
 
 
-def _times(record: Record) -> dict[Key, tuple[float, int]]:
+def _times(record: ComparedRecord) -> dict[Key, tuple[float, int]]:
     """-> (time since the start [s], place in the record) of each message; of a frame's messages, that of the frame."""
     return {
         key: (record.frame_t_s[key.frame_id] if key.frame_id >= 0 else key.t_ns / NS, place)
@@ -118,7 +118,7 @@ def _times(record: Record) -> dict[Key, tuple[float, int]]:
     }
 
 
-def _contents_of(record: Record, wanted: set[Key]) -> dict[Key, dict[str, Any]]:
+def _contents_of(record: ComparedRecord, wanted: set[Key]) -> dict[Key, dict[str, Any]]:
     """The contents of single messages, by a second pass over the record."""
     if not wanted:
         return {}
@@ -157,7 +157,7 @@ def _counts(keys: list[Key], differing: list[Key], only_a: list[Key], only_b: li
     }
 
 
-def _delays(record: Record) -> dict[str, float] | None:
+def _delays(record: ComparedRecord) -> dict[str, float] | None:
     """Delay from exposure to publication of the last estimate of each frame; None without estimates."""
     delays = [estimate.delay_ms for estimate in record.estimates.values()]
     if not delays:
@@ -165,7 +165,7 @@ def _delays(record: Record) -> dict[str, float] | None:
     return {f"p{p}": round(float(np.percentile(delays, p)), 2) for p in (50, 95, 99)}
 
 
-def _about(record: Record) -> dict[str, Any]:
+def _about(record: ComparedRecord) -> dict[str, Any]:
     return {
         "path": str(record.path),
         "files": [file.name for file in record.result.files],

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from terrafix.runtime.run_dir import write_atomic
 from terrafix_tools.console.maps import SUFFIX
-from terrafix_tools.console.payloads import Area
+from terrafix_tools.console.payloads import RouteArea
 from terrafix_tools.console.problems import Refusal
 
 MAX_KM2 = 2000.0  # of a corridor [spec: docs/console.md]
@@ -27,7 +27,7 @@ def map_name(flight_id: str) -> str:
     return f"area-{flight_id}"
 
 
-def check_area(area: Area) -> None:
+def check_area(area: RouteArea) -> None:
     """Raises Refusal: larger than MAX_KM2."""
     points = [(p.lat, p.lon) for p in area.waypoints]
     length_m = sum(
@@ -52,7 +52,7 @@ class AreaMaps:
     def available(self) -> bool:
         return self._sources is not None
 
-    def begin(self, flight_id: str, area: Area) -> None:
+    def begin(self, flight_id: str, area: RouteArea) -> None:
         self._tasks[flight_id] = asyncio.create_task(self._make(flight_id, area))
 
     async def stop(self) -> None:
@@ -76,12 +76,12 @@ class AreaMaps:
     def _route(self, flight_id: str) -> Path:
         return self._maps / f"{map_name(flight_id)}.geojson"
 
-    async def _make(self, flight_id: str, area: Area) -> None:
+    async def _make(self, flight_id: str, area: RouteArea) -> None:
         async with self._one:
             error = "" if self._package(flight_id).is_file() else await self._build(flight_id, area)
         await self._done(flight_id, error)
 
-    async def _build(self, flight_id: str, area: Area) -> str:
+    async def _build(self, flight_id: str, area: RouteArea) -> str:
         """-> "", or why there is no map."""
         if self._sources is None:
             return "the console was started without --sources, which this flight needs for its map"

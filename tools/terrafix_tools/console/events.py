@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from terrafix_tools.console.payloads import Ellipse, FlightState, FrameResult, Gps
+from terrafix_tools.console.payloads import CameraPose, Ellipse, FlightState, FragmentState, FrameResult, Gps
 
 
 class Event(BaseModel):
@@ -15,15 +15,15 @@ class FrameProcessed(Event, FrameResult):
     """A frame has its immediate result."""
 
 
-class FrameRefined(Event):
-    """Later frames, or the end of the flight, have moved the position of a frame."""
+class FrameRefined(Event, CameraPose):
+    """Later frames, or the end of the flight, have moved a frame."""
 
     frame_id: int
     gps: Gps
     refined: bool = True
     altitude: float | None
     ellipse: Ellipse
-    source: str  # "smoother" (during the flight), "flight" (after its end)
+    source: str  # "smoother" (during the flight), "flight" (after its end), "finalised" (by all of it, solved anew)
     fragment_id: int
 
 
@@ -58,11 +58,39 @@ class ProcessingBlocked(Event):
 
 
 class ChunkMerged(Event):
-    """A fragment is tied to the flight from ``frame_id`` on."""
+    """A fragment is tied to the flight from ``frame_id`` on; one that begins joined, with its first frame."""
 
     fragment_id: int
     frame_id: int
     frames: int  # of the fragment until then
+
+
+class FragmentChanged(Event):
+    """A fragment has begun, or its state has changed."""
+
+    fragment_id: int
+    frame_id: int
+    state: FragmentState
+
+
+class RecoveryStarted(Event):
+    """The position is lost at this frame: a search begins."""
+
+    frame_id: int
+
+
+class RecoverySucceeded(Event):
+    """The search has found the position; ``frames``: since it was lost."""
+
+    frame_id: int
+    frames: int
+
+
+class UserFixApplied(Event):
+    """A user fix has passed the gate and is in the graph. A refused one is a ``VerdictGiven`` with the reason."""
+
+    frame_id: int
+    detail: str
 
 
 class StateChanged(Event):
@@ -89,8 +117,18 @@ class HintAnswered(Event):
     text: str
 
 
+class FinaliseProgress(Event):
+    """The completed flight is computed as a whole. ``stage``: "read" (the record), "compare" (solutions, at held-out
+    map matches), "smooth"; ``of`` None: not known."""
+
+    stage: str
+    done: int
+    of: int | None
+
+
 class FlightCompleted(Event):
-    """``statistics``: frames, localised, refined, fragments, merged, hints; ``median_radius95_m``."""
+    """``statistics``: frames, localised, refined, finalised, fragments, merged, hints; ``median_radius95_m``;
+    ``not_finalised``: why, else empty."""
 
     statistics: dict[str, Any]
 
@@ -108,9 +146,14 @@ EVENTS: tuple[type[Event], ...] = (
     UserInputNeeded,
     ProcessingBlocked,
     ChunkMerged,
+    FragmentChanged,
+    RecoveryStarted,
+    RecoverySucceeded,
+    UserFixApplied,
     StateChanged,
     VerdictGiven,
     HintAnswered,
+    FinaliseProgress,
     FlightCompleted,
     Health,
 )

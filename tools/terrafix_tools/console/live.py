@@ -116,7 +116,8 @@ class LiveFlights:
             if message is None:
                 raise TerrafixError("that frame has no attitude, or the pixel shows no ground; choose another")
             radius_m = min(max(message.radius_m, RADIUS_M[0]), RADIUS_M[1])
-            return send_hint(message.lat_deg, message.lon_deg, radius_m, str(live.run.path))
+            fix = message.frame_id, message.sigma_m
+            return send_hint(message.lat_deg, message.lon_deg, radius_m, str(live.run.path), fix)
 
     def frame_jpeg(self, flight_id: str, frame_id: int) -> bytes | None:
         """The pixels of a frame that is still in the ring of the run."""

@@ -17,11 +17,10 @@ class Question(msgspec.Struct):
 
     out: str
     map: str
-    frame_id: int
-    pixel: tuple[float, float]  # of the frame as it was read
+    pixels: list[tuple[int, tuple[float, float]]]  # frame, and pixel of the frame as it was read
 
 
-class Answer(msgspec.Struct):
+class LocateAnswer(msgspec.Struct):
     """``refused``: why there is no position; ""  with one."""
 
     refused: str = ""
@@ -30,6 +29,7 @@ class Answer(msgspec.Struct):
     alt_amsl_m: float | None = None
     radius95_m: float = 0.0
     surface: str = ""
+    consistent: bool = True
 
 
 class LocatingProcess:
@@ -41,7 +41,7 @@ class LocatingProcess:
         self._one = asyncio.Lock()
         self._idle: asyncio.TimerHandle | None = None
 
-    async def ask(self, question: Question) -> Answer:
+    async def ask(self, question: Question) -> LocateAnswer:
         """Raises Refusal: too many questions, or the process failed."""
         if self._waiting >= self._most:
             raise Refusal(429, f"{self._most} positions are being computed; try again later")
@@ -52,7 +52,7 @@ class LocatingProcess:
         finally:
             self._waiting -= 1
 
-    async def _ask(self, question: Question) -> Answer:
+    async def _ask(self, question: Question) -> LocateAnswer:
         if self._idle is not None:
             self._idle.cancel()
         if self._process is None or self._process.returncode is not None:
@@ -72,7 +72,7 @@ class LocatingProcess:
             await self.stop()
             raise Refusal(503, "the position could not be computed; the log of the console has the reason")
         self._idle = asyncio.get_running_loop().call_later(IDLE_S, self._process.stdin.close)
-        return msgspec.json.decode(line, type=Answer)
+        return msgspec.json.decode(line, type=LocateAnswer)
 
     async def stop(self) -> None:
         if self._idle is not None:

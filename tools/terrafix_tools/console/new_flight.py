@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from pydantic import ValidationError
@@ -26,9 +27,9 @@ def new_flight(
         raise SourceError(f"{description}: there is no [camera]; add one with width, height, fx, fy, cx, cy in pixels")
     given = {
         "name": name or read.name,
-        "camera": {k: v for k, v in msgspec.to_builtins(read.camera).items() if k != "model"},
-        "mount": msgspec.to_builtins(read.mount),
-        "telemetry": {k: v for k, v in msgspec.to_builtins(read.telemetry).items() if k != "tlog_t0_us"},
+        "camera": _without(read.camera, "model"),
+        "mount": _without(read.mount, "gimbal", "gimbal_device", "stabilised"),
+        "telemetry": _without(read.telemetry, "tlog_t0_us", "log_zero_s"),
         "start": _start(read),
         "map": map_name or None,
         "area": None if mission is None else {"waypoints": _waypoints(mission), "corridor_m": corridor_m},
@@ -81,3 +82,8 @@ def telemetry_of(table: Path, images: list[tuple[str, Path]]) -> dict[str, str]:
     if missing is not None:
         raise SourceError(f"{table}: has no row for {missing}")
     return {"": lines[0], **{name: f"{name},{rows[path.name]}" for name, path in images}}
+
+
+def _without(table: msgspec.Struct, *keys: str) -> dict[str, Any]:
+    """A table of the description without what images alone do not need."""
+    return {key: value for key, value in msgspec.to_builtins(table).items() if key not in keys}

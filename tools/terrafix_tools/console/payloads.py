@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 MAX_NAME = 100  # characters of a name [spec: docs/console.md]
 MIN_IMAGE_PX, MAX_IMAGE_PX = (640, 480), (6252, 4168)  # width, height [spec: RS-11 of the service contract]
 MAX_WAYPOINTS = 500  # of an area [spec: docs/console.md]
+MAX_PIXELS = 50  # of one object [spec: docs/console.md]
 
 Latitude = Annotated[float, Field(ge=-90, le=90, allow_inf_nan=False)]
 Longitude = Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
@@ -36,6 +37,16 @@ class Ellipse(BaseModel):
     semi_major_m: float
     semi_minor_m: float
     bearing_deg: float
+
+
+class CameraPose(BaseModel):
+    """A refined camera, beside its position. ``orientation``: quaternion w, x, y, z in east, north, up; ``covariance``:
+    36 numbers, row by row, of position [m], then rotation [rad] about east, north, up; ``m_per_unit``: metres of a unit
+    of odometry in the submap of the frame. None: not refined."""
+
+    orientation: list[float] | None = None
+    covariance: list[float] | None = None
+    m_per_unit: float | None = None
 
 
 class FlightState(StrEnum):
@@ -104,7 +115,7 @@ class Waypoint(Strict):
     lon: Longitude
 
 
-class Area(Strict):
+class RouteArea(Strict):
     """The route of the flight, whose corridor is fetched from the map sources of the service in the background."""
 
     waypoints: Annotated[list[Waypoint], Field(min_length=2, max_length=MAX_WAYPOINTS)]
@@ -121,7 +132,7 @@ class NewFlight(Strict):
     telemetry: Telemetry = Telemetry()
     start: Start | None = None
     map: Annotated[str, Field(min_length=1, max_length=MAX_NAME)] | None = None
-    area: Area | None = None
+    area: RouteArea | None = None
     height_m: Annotated[float, Field(gt=0, le=20_000)] | None = None
     yaw_deg: Degrees | None = None  # heading for images that state none
 
@@ -152,6 +163,13 @@ class Images(BaseModel):
     next_number: int | None
 
 
+class FragmentState(StrEnum):
+    UNANCHORED = "unanchored"  # by dead reckoning alone
+    MATCHING = "matching"  # ... and a search for it is active
+    ANCHORED = "anchored"  # a map match of its own is accepted
+    MERGED = "merged"  # tied to the flight before it
+
+
 class Fragment(BaseModel):
     """Frames that odometry connects to each other (a chunk)."""
 
@@ -161,6 +179,7 @@ class Fragment(BaseModel):
     frames: int
     joined: bool  # tied to the flight by something other than dead reckoning
     merged_at_frame: int | None = None
+    state: FragmentState = FragmentState.UNANCHORED
 
 
 class InputRequest(BaseModel):
@@ -189,6 +208,16 @@ class Flight(BaseModel):
     error: str = ""  # why the flight cannot be processed
 
 
+class FlightConfig(BaseModel):
+    """``flight``: as it was created, with defaults; empty for a live one, whose record has all of it. ``config``: the
+    effective configuration."""
+
+    flight_id: str
+    map: str
+    flight: dict[str, Any]
+    config: dict[str, Any]
+
+
 class Flights(BaseModel):
     flights: list[Flight]
 
@@ -201,7 +230,7 @@ class Accepted(BaseModel):
     next_number: int
 
 
-class FrameResult(BaseModel):
+class FrameResult(CameraPose):
     """Position of one frame. ``gps`` is None until the frame has one; ``confidence``: the probability that the position
     is within 20 m, by its covariance."""
 
@@ -221,7 +250,8 @@ class FrameResult(BaseModel):
     fragment_id: int = -1
     joined: bool = True
     error: str = ""  # why the image could not be used
-    refined: bool = False  # gps, altitude and ellipse are the refined ones
+    refined: bool = False  # gps, altitude, ellipse and the pose are the refined ones
+    refined_by: str = ""  # "smoother", "flight", "finalised"; as in FrameRefined
 
 
 class Results(BaseModel):
@@ -241,12 +271,13 @@ class PixelPoint(Strict):
 
 
 class UserFix(Strict):
-    """A pixel of a frame and the place on the map that it shows, with a sigma of 5 m."""
+    """A pixel of a frame and the place on the map that it shows, with its 1-sigma per axis."""
 
     frame_id: FrameId
     pixel: PixelPoint
     lat: Latitude
     lon: Longitude
+    sigma_m: Annotated[float, Field(ge=0.1, le=1000)] = 5.0
 
 
 class Hint(Strict):
@@ -264,9 +295,20 @@ class Steered(BaseModel):
     detail: str
 
 
-class ObjectPixel(Strict):
+class OtherPixel(Strict):
+    """A pixel of another frame."""
+
+    frame_id: FrameId
     pixel_x: Annotated[float, Field(ge=-0.5, le=65_535)]
     pixel_y: Annotated[float, Field(ge=-0.5, le=65_535)]
+
+
+class ObjectPixel(Strict):
+    """``others``: the same object in further frames."""
+
+    pixel_x: Annotated[float, Field(ge=-0.5, le=65_535)]
+    pixel_y: Annotated[float, Field(ge=-0.5, le=65_535)]
+    others: Annotated[list[OtherPixel], Field(max_length=MAX_PIXELS)] = []
 
 
 class ObjectGps(BaseModel):
@@ -274,8 +316,9 @@ class ObjectGps(BaseModel):
 
     gps: Gps
     accuracy_meters: float
-    altitude: float | None
-    surface: str  # "points" (the fragment's own), "elevation" (of the map), "plane"
+    altitude: float | None  # m AMSL; None: no height above sea level is known
+    surface: str  # "points" (of odometry), "elevation" (of the map), "plane"
+    consistent: bool = True  # all pixels show one object
 
 
 class Tokens(Strict):

@@ -11,6 +11,7 @@ from terrafix_tools.console.guard import COOKIE, token_of
 from terrafix_tools.console.payloads import (
     Accepted,
     Flight,
+    FlightConfig,
     Flights,
     Hint,
     MapInfo,
@@ -161,6 +162,12 @@ async def upload(request: Request, flight_id: FlightId) -> Accepted:
     return await service_of(request).upload(request, flight_id)
 
 
+@router.get("/flights/{flight_id}/config")
+def flight_config(request: Request, flight_id: FlightId) -> FlightConfig:
+    """What a flight was created with, and the configuration that computes it."""
+    return service_of(request).flight_config(flight_id)
+
+
 @router.get("/flights/{flight_id}/results")
 def results(
     request: Request,
@@ -179,7 +186,8 @@ def results(
 
 @router.post("/flights/{flight_id}/user-fix", status_code=202)
 async def user_fix(request: Request, flight_id: FlightId, fix: UserFix) -> Steered:
-    """What a pixel of a frame shows lies there, to 5 m. Used as a prior: the map decides."""
+    """What a pixel of a frame shows lies there, to 5 m or ``sigma_m``. A measurement of the position, if the gate
+    accepts it; the search begins there, if the position is lost or unconfirmed."""
     return await service_of(request).steer(flight_id, fix)
 
 

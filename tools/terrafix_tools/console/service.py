@@ -23,8 +23,8 @@ from terrafix_tools.console.locating import LocatingProcess, Question
 from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
     Accepted,
-    Area,
     Flight,
+    FlightConfig,
     FlightKind,
     Flights,
     FlightState,
@@ -36,6 +36,7 @@ from terrafix_tools.console.payloads import (
     ObjectPixel,
     RecordingFile,
     Recordings,
+    RouteArea,
     ServiceHealth,
     Steered,
     UserFix,
@@ -46,6 +47,7 @@ from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database
 from terrafix_tools.console.store.flights import StoredEvent
 from terrafix_tools.console.workers import Reports, Workers
+from terrafix_tools.finalised import TABLE
 
 if TYPE_CHECKING:
     from terrafix_tools.console.live import LiveFlights
@@ -115,6 +117,12 @@ class Service:
         with self.database.read() as db:
             return flights.flight_of(db, flight_id)
 
+    def flight_config(self, flight_id: str) -> FlightConfig:
+        with self.database.read() as db:
+            row = flights.row_of(db, flight_id)
+        spec = msgspec.json.decode(row.spec)
+        return FlightConfig(flight_id=flight_id, map=row.map_name, flight=spec, config=self.config()["flights"])
+
     def frame_image(self, flight_id: str, frame_id: int) -> Response:
         flight = self.flight(flight_id)
         headers = {"cache-control": "private, max-age=3600"}
@@ -142,7 +150,8 @@ class Service:
     def recordings(self, flight_id: str) -> Recordings:
         folder = self._out(self.flight(flight_id))
         found = [p.name for p in folder.iterdir() if p.is_file()] if folder.is_dir() else []
-        names = sorted(name for name in found if RECORDING.fullmatch(name))
+        # What was finalised comes first: it replaces the estimates.
+        names = sorted((name for name in found if RECORDING.fullmatch(name)), key=lambda name: (name != TABLE, name))
         files = [
             RecordingFile(
                 name=name, bytes=(folder / name).stat().st_size, url=f"/flights/{flight_id}/recordings/{name}"
@@ -221,23 +230,28 @@ class Service:
             accuracy_meters=round(answer.radius95_m, 2),
             altitude=None if answer.alt_amsl_m is None else round(answer.alt_amsl_m, 2),
             surface=answer.surface,
+            consistent=answer.consistent,
         )
 
     def _question(self, flight_id: str, frame_id: int, pixel: ObjectPixel) -> Question:
-        flight, uv = self.flight(flight_id), (pixel.pixel_x, pixel.pixel_y)
+        flight = self.flight(flight_id)
         out = self._out(flight)
+        pixels = [(frame_id, (pixel.pixel_x, pixel.pixel_y))]
+        pixels += [(other.frame_id, (other.pixel_x, other.pixel_y)) for other in pixel.others]
         with self.database.read() as db:
-            if not flights.has_result(db, flight_id, frame_id):
-                raise Refusal(404, f"flight {flight_id} has no result of frame {frame_id}; frame_processed tells when")
+            for seen, _ in pixels:
+                if not flights.has_result(db, flight_id, seen):
+                    raise Refusal(404, f"flight {flight_id} has no result of frame {seen}; frame_processed tells when")
             row = flights.row_of(db, flight_id)
         if flight.kind is FlightKind.LIVE:
             map_path = None if self.live is None or self.live.current is None else self.live.current.map_path
         else:
             new = NewFlight.model_validate_json(row.spec)
             map_path = self.maps.path(row.map_name)
-            _check_pixel(*uv, new)
-            uv = stored_pixel(*uv, new)
-        return Question(out=str(out), map="" if map_path is None else str(map_path), frame_id=frame_id, pixel=uv)
+            for _, uv in pixels:
+                _check_pixel(*uv, new)
+            pixels = [(seen, stored_pixel(*uv, new)) for seen, uv in pixels]
+        return Question(out=str(out), map="" if map_path is None else str(map_path), pixels=pixels)
 
     async def complete(self, flight_id: str) -> Flight:
         def mark() -> Flight:
@@ -299,7 +313,7 @@ class Service:
     def _live_health(self, flight_id: str, found: dict[str, Any]) -> None:
         self._loop.call_soon_threadsafe(self.feeds.pass_on, flight_id, Health(facts=found))
 
-    def _maps_to_make(self) -> list[tuple[str, Area]]:
+    def _maps_to_make(self) -> list[tuple[str, RouteArea]]:
         with self.database.read() as db:
             return flights.maps_to_make(db)
 

@@ -7,7 +7,7 @@ MB = 2**20
 
 
 @dataclass(frozen=True)
-class Limits:
+class ServiceLimits:
     """Bounds of what one service accepts [spec: docs/console.md]."""
 
     flights: int = 1000  # stored
@@ -42,7 +42,7 @@ class Settings:
     nice: int = 10  # of the processes that compute: the service and what flies come first
     configs: tuple[Path, ...] = ()
     models: tuple[str, ...] = ()
-    limits: Limits = field(default_factory=Limits)
+    limits: ServiceLimits = field(default_factory=ServiceLimits)
 
     @property
     def flights(self) -> Path:

@@ -35,7 +35,7 @@ from terrafix.vision.sources.photos import (
 from terrafix.vision.sources.table import Row, read_table
 from terrafix_tools.console.payloads import MAX_IMAGE_PX, MIN_IMAGE_PX, Accepted, NewFlight
 from terrafix_tools.console.problems import FULL, Refusal
-from terrafix_tools.console.settings import Limits
+from terrafix_tools.console.settings import ServiceLimits
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database
 from terrafix_tools.console.store.flights import StoredImage
@@ -64,7 +64,7 @@ class Part:
 class _Reader:
     """Callbacks of the parser, which bounds the headers. Every part goes to a file of its own as it arrives."""
 
-    def __init__(self, folder: Path, limits: Limits) -> None:
+    def __init__(self, folder: Path, limits: ServiceLimits) -> None:
         self._folder, self._limits = folder, limits
         self.parts: list[Part] = []
         self._name = bytearray()
@@ -138,7 +138,7 @@ def incoming(folder: Path) -> Iterator[Path]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-async def read_parts(request: Request, folder: Path, limits: Limits) -> list[Part]:
+async def read_parts(request: Request, folder: Path, limits: ServiceLimits) -> list[Part]:
     """The parts of a multipart/form-data body, as files in ``folder``. Raises Refusal."""
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary", b"")
@@ -178,7 +178,7 @@ async def read_parts(request: Request, folder: Path, limits: Limits) -> list[Par
     return reader.parts
 
 
-def check_room(folder: Path, limits: Limits) -> None:
+def check_room(folder: Path, limits: ServiceLimits) -> None:
     """Raises Refusal (507): the disk is almost full."""
     free = shutil.disk_usage(folder).free
     if free < limits.disk_reserve_bytes:
@@ -204,7 +204,7 @@ def check_image(part: Part, new: NewFlight) -> str:
     return suffix
 
 
-def store_batch(database: Database, flight_id: str, folder: Path, parts: list[Part], limits: Limits) -> Accepted:
+def store_batch(database: Database, flight_id: str, folder: Path, parts: list[Part], limits: ServiceLimits) -> Accepted:
     """Checks a batch and gives it to the flight: every image, or none. ``folder``: of the flight. Raises Refusal."""
     images = [part for part in parts if part.field == IMAGES]
     least, most = limits.batch
@@ -346,7 +346,7 @@ class Slots:
 
 
 async def take_batch(
-    request: Request, database: Database, flight_id: str, folder: Path, limits: Limits, slots: Slots
+    request: Request, database: Database, flight_id: str, folder: Path, limits: ServiceLimits, slots: Slots
 ) -> Accepted:
     """The whole way of a batch from the request into the flight. ``folder``: of the flight."""
     try:

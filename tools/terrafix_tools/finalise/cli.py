@@ -14,10 +14,11 @@ def finalise(
     from rich.console import Console
 
     from terrafix_tools.before_after import table
+    from terrafix_tools.finalise.run import bar, last_lines
     from terrafix_tools.finalise.run import finalise as run_finalise
-    from terrafix_tools.finalise.run import last_lines
 
-    summary = run_finalise(folder, progress=not quiet)
+    with bar(not quiet) as step:
+        summary = run_finalise(folder, step)
     for flight in summary["flights"]:
         if flight["before_after"]:
             Console().print(table(flight["before_after"]))

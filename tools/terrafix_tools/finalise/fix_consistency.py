@@ -60,5 +60,5 @@ def ambiguous_segments(
             other = AlternativePosition()
             # The error of their common offset is far less than the distance between them.
             other.spawn([o for o in offsets if np.hypot(*(o - middle)) <= CONSISTENT_M], np.zeros((2, 2)), fixed=True)
-            if other.probability > 0.0:
-                yield at, other.inflation_m2()
+            if other.weight > 0.0:
+                yield at, other.moments_m2()

@@ -189,6 +189,7 @@ class FlightGraph:
     held_out: list[Fix] = field(default_factory=list)  # map matches that the estimator was not given
     loops: list[LoopClosure] = field(default_factory=list)
     node_of: dict[int, int] = field(default_factory=dict)
+    fragment_of: dict[int, int] = field(default_factory=dict)  # of each frame
     refused: dict[str, int] = field(default_factory=dict)  # number of map matches that are not used, by verdict
     lost_sigma_m: dict[int, float] = field(default_factory=dict)  # node -> 1-sigma of a position that may be wrong
     radial_k1: tuple[float, float] = 0.0, 0.0  # final radial coefficient, and its 1-sigma
@@ -214,18 +215,18 @@ class RecordedEstimator(Estimator):
         return result
 
 
-class FlightReplayer:
-    """Feeds a record, message after message, to the node that flew. ``flights``: one for each Origin, and each
+class FlightReplayer(EstimatorNode):
+    """The node that flew, which keeps what it is fed. ``flights``: one for each Origin, and each
     InitialPosition, from which its estimator began; ``estimators``: those of them. ``hold_out_every``: of the runs of
     HELD_OUT_RUN map matches with a pose, one in so many is held out; 0: none."""
 
     def __init__(self, hold_out_every: int = 0) -> None:
         self.flights: list[FlightGraph] = []
         self.estimators: list[Estimator] = []
-        self.node = EstimatorNode(make_estimator=self._make_estimator)
+        super().__init__(make_estimator=self._recorded_estimator)
         self._hold_out_every, self._with_pose = hold_out_every, 0
 
-    def _make_estimator(self, origin: Origin, prior: NavPrior | None) -> Estimator:
+    def _recorded_estimator(self, origin: Origin, prior: NavPrior | None) -> Estimator:
         self.flights.append(FlightGraph(origin))
         self.estimators.append(RecordedEstimator(origin, prior, self.flights[-1]))
         return self.estimators[-1]
@@ -233,8 +234,8 @@ class FlightReplayer:
     def on(self, message: Message) -> Iterable[Message]:
         if isinstance(message, MapMatch) and self._holds_out(message):
             return []
-        published = list(self.node.on(message))
-        estimator = self.node.estimator
+        published = list(super().on(message))
+        estimator = self.estimator
         if estimator is None:
             return published
         flight = self.flights[-1]
@@ -242,6 +243,7 @@ class FlightReplayer:
             flight.has_height = flight.has_height or message.agl_m is not None
         elif isinstance(message, Odometry) and any(isinstance(s, NavEstimate) for s in published):
             flight.node_of[message.frame_id] = flight.recorder.graph.newest
+            flight.fragment_of[message.frame_id] = message.fragment_id
             flight.recorder.add_triples(message)
             flight.features.add(message)
             flight.radial_k1 = estimator.state.radial_k1_estimate
@@ -253,7 +255,7 @@ class FlightReplayer:
 
     def _holds_out(self, match: MapMatch) -> bool:
         """Counts the matches with a pose, and holds out one run in ``hold_out_every``, where its frames have nodes."""
-        estimator = self.node.estimator
+        estimator = self.estimator
         if not self._hold_out_every or estimator is None or match.verdict is not Verdict.ACCEPTED:
             return False
         run, self._with_pose = self._with_pose // HELD_OUT_RUN, self._with_pose + 1
@@ -265,7 +267,7 @@ class FlightReplayer:
     def _add_match(self, received: MapMatch, verdict: Verdict, estimator: Estimator) -> None:
         flight, fix = self.flights[-1], self._fix(received, estimator)
         if (node := flight.node_of.get(received.frame_id)) is not None:
-            flight.lost_sigma_m[node] = estimator.hypotheses.anywhere_m
+            flight.lost_sigma_m[node] = estimator.doubts.sigma_m
         if isinstance(fix, Verdict):
             flight.refused[str(fix)] = flight.refused.get(str(fix), 0) + 1
         else:

@@ -10,7 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from terrafix.core.errors import OutputError
+from terrafix.core.errors import OutputError, SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Odometry
 from terrafix_tools.estimates import PARTIAL
@@ -25,6 +25,7 @@ VERTEX = np.dtype(
     [(name, "<f8") for name in ("x", "y", "z")]
     + [("sigma", "<f4"), ("views", "<u2"), ("fragment", "<i4"), ("keyframe", "<u4")]
 )  # [spec: PLY, a scalar property for each column]
+END_OF_HEADER = b"end_header\n"
 PLY_TYPES = {"<f8": "double", "<f4": "float", "<u2": "ushort", "<i4": "int", "<u4": "uint"}
 
 
@@ -131,6 +132,17 @@ def _points(rays: _Rays) -> np.ndarray:
 def cloud_name(flight: int) -> str:
     """Of the flight of this number, from 0, in a record."""
     return POINTS if not flight else f"points-{flight + 1}.ply"
+
+
+def read_ply(path: Path) -> np.ndarray:
+    """-> points (N,) of VERTEX, of a file that ``write_ply`` wrote. Raises SourceError."""
+    try:
+        _, end, body = path.read_bytes().partition(END_OF_HEADER)
+        if not end:
+            raise ValueError("no header")
+        return np.frombuffer(body, VERTEX)
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: cannot be read ({error}); write it again with 'terrafix finalise'") from None
 
 
 def write_ply(path: Path, points: np.ndarray, axes: LocalFrame) -> None:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -16,17 +16,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
-from terrafix.core.geodesy import LocalFrame, yaw_of
+from terrafix.core.geodesy import LocalFrame, quat_from_rot, yaw_of
 from terrafix.core.map_error import shared_variance_m2
-from terrafix.core.pose import exp_so3, tangent_to_world
+from terrafix.core.pose import exp_so3, tangent_to_world, world_to_tangent
 from terrafix.estimator.estimator import Estimator
-from terrafix.estimator.state import EAST, HORIZONTAL, MOUNT_TILT, NORTH, POSE_SIZE, TRANSLATION, UP
+from terrafix.estimator.state import EAST, HORIZONTAL, MOUNT_TILT, NORTH, TRANSLATION, UP
 from terrafix.messages import Frame, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import versions
 from terrafix.recorder.reader import ReadResult, check_format, read_flight
 from terrafix_tools.before_after import FINALISED, REFINED, Change, kept_line
-from terrafix_tools.estimates import NS
+from terrafix_tools.estimates import NS, numbers
 from terrafix_tools.finalise.batch_smoother import Smoothed, smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, Choice, Comparison, choose
@@ -39,27 +39,31 @@ REPLAYED = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.subscr
 Step = Callable[[str, int, int | None], None]
 
 
-def finalise(folder: Path, *, progress: bool = False) -> dict[str, Any]:
+def _no_step(_name: str, _done: int, _of: int | None) -> None:
+    """Progress that nobody sees."""
+
+
+def finalise(folder: Path, step: Step = _no_step) -> dict[str, Any]:
     """Writes finalised.csv, finalised.json and points.ply beside the record, returns the summary (docs/finalise.md).
 
-    ``folder``: of a replay or of a live run, or a record file in it. Raises SourceError, OutputError."""
+    ``folder``: of a replay or of a live run, or a record file in it. ``step``: gets the progress. Raises SourceError,
+    OutputError."""
     began_s = time.process_time()
     result = ReadResult()
-    with _bar(progress) as step:
-        chosen = _choices(folder, step)
-        rows, replayer = _replay(folder, result, step)
-        smoothed = [
-            _smoothed(flight, estimator, choice, rows, step)
-            for (flight, estimator), choice in zip(_flown(replayer), chosen, strict=True)
-        ]
-        summary: dict[str, Any] = {
-            "record": [path.name for path in result.files],
-            "cut_off": [path.name for path in result.truncated_files],
-            "undecodable": result.undecodable,
-            "frames": len(rows),
-            "versions": versions(),
-            "flights": [part for part, _ in smoothed],
-        }
+    chosen = _choices(folder, step)
+    rows, replayer = _replay(folder, result, step)
+    smoothed = [
+        _smoothed(flight, estimator, choice, rows, step)
+        for (flight, estimator), choice in zip(_flown(replayer), chosen, strict=True)
+    ]
+    summary: dict[str, Any] = {
+        "record": [path.name for path in result.files],
+        "cut_off": [path.name for path in result.truncated_files],
+        "undecodable": result.undecodable,
+        "frames": len(rows),
+        "versions": versions(),
+        "flights": [part for part, _ in smoothed],
+    }
     summary["finalised"] = sum(row.lat_deg is not None for row in rows.values())
     summary["cpu_s"] = round(time.process_time() - began_s, 2)
     out = folder if folder.is_dir() else folder.parent
@@ -95,10 +99,6 @@ def last_lines(summary: dict[str, Any], folder: Path) -> Iterator[str]:
 def flights_of(folder: Path) -> list[FlightGraph]:
     """Flights of a record, as the smoother takes them. Raises SourceError."""
     return [flight for flight, _ in _flown(_replay(folder, ReadResult(), _no_step)[1])]
-
-
-def _no_step(_name: str, _done: int, _of: int | None) -> None:
-    """Progress that nobody sees."""
 
 
 def _flown(replayer: FlightReplayer) -> list[tuple[FlightGraph, Estimator]]:
@@ -153,12 +153,15 @@ def _smoothed(
         track |= {i: at for i, at in refined_track(flight, estimator).items() if i in track}
     if not choice.estimates_lens:
         track = heights_as_seen(flight, track)
+    scales = m_per_unit(flight, found)
     lost: Counter[int] = Counter()
     for frame_id, node in flight.node_of.items():
         if not found.placed[node]:
             lost[int(found.begins[node])] += 1
         elif frame_id in rows:
             _fill(rows[frame_id], track[frame_id], frame, r_b_c)
+            rows[frame_id].fragment_id = flight.fragment_of.get(frame_id, -1)
+            rows[frame_id].m_per_unit = scales.get(int(found.begins[node]))
             if not estimator.state.amsl_known:
                 rows[frame_id].alt_amsl_m = None
     why = "no map match is accepted there, and its start is unknown"
@@ -169,7 +172,7 @@ def _smoothed(
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedCamera:
     """A camera with the covariance of its pose (6, 6), tangent order, and its calibration state."""
 
     pose: gtsam.Pose3
@@ -177,14 +180,14 @@ class Placed:
     bias: np.ndarray
 
 
-def solved_track(flight: FlightGraph, found: Smoothed) -> dict[int, Placed]:
+def solved_track(flight: FlightGraph, found: Smoothed) -> dict[int, PlacedCamera]:
     """By frame: the batch solution."""
-    return {i: Placed(found.poses[n], found.covs[n], found.bias[n]) for i, n in flight.node_of.items()}
+    return {i: PlacedCamera(found.poses[n], found.covs[n], found.bias[n]) for i, n in flight.node_of.items()}
 
 
-def heights_as_seen(flight: FlightGraph, track: dict[int, Placed]) -> dict[int, Placed]:
+def heights_as_seen(flight: FlightGraph, track: dict[int, PlacedCamera]) -> dict[int, PlacedCamera]:
     """The covariance with what the description leaves open of the focal length: heights are as seen through it."""
-    seen, camera = dict[int, Placed](), flight.origin.camera
+    seen, camera = dict[int, PlacedCamera](), flight.origin.camera
     for frame_id, at in track.items():
         up = at.pose.rotation().matrix()[UP]
         height_m = float(at.pose.translation()[UP]) - (flight.origin.ground_amsl_m or 0.0)
@@ -194,22 +197,31 @@ def heights_as_seen(flight: FlightGraph, track: dict[int, Placed]) -> dict[int, 
     return seen
 
 
-def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, Placed]:
-    """By frame: the positions that the estimator refines after landing, as in estimates.csv; the attitude is the last
-    one in flight."""
-    map_var = shared_variance_m2(estimator.map_sigma_m)
+def refined_track(flight: FlightGraph, estimator: Estimator) -> dict[int, PlacedCamera]:
+    """By frame: the positions that the estimator refines after landing, as in estimates.csv, with its orientations."""
+    map_cov = np.diag([shared_variance_m2(estimator.map_sigma_m)] * 2 + [0.0] * 4)
     placed = {}
-    for frame_id, (p_m, cov_m2) in estimator.refine().items():
+    for frame_id, past in estimator.refine().items():
         if (node := flight.node_of.get(frame_id)) is None:
             continue
-        state = flight.recorder.nodes[node].state
-        r, cov = state.pose.rotation().matrix(), np.zeros((POSE_SIZE, POSE_SIZE))
-        cov[TRANSLATION, TRANSLATION] = r.T @ (cov_m2 + np.diag([map_var, map_var, 0.0])) @ r
-        placed[frame_id] = Placed(gtsam.Pose3(state.pose.rotation(), p_m), cov, state.calibration)
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(past.r_w_c), past.p_m)
+        cov = world_to_tangent(past.cov + map_cov, past.r_w_c)
+        placed[frame_id] = PlacedCamera(pose, cov, flight.recorder.nodes[node].state.calibration)
     return placed
 
 
-def _fill(row: FinalRow, placed: Placed, frame: LocalFrame, r_b_c: np.ndarray) -> None:
+def m_per_unit(flight: FlightGraph, found: Smoothed) -> dict[int, float]:
+    """By the first node of each segment: its length in the solution over that by odometry as it was flown."""
+    lengths: defaultdict[int, np.ndarray] = defaultdict(lambda: np.zeros(2))
+    for i, node in enumerate(flight.recorder.nodes):
+        if node.motion is not None and node.motion.rays is not None and found.placed[i]:
+            solved_m = found.poses[node.parent].between(found.poses[i]).translation()
+            flown = node.motion.between.translation()
+            lengths[int(found.begins[i])] += np.linalg.norm([solved_m, flown], axis=1)
+    return {begin: float(solved_m / flown) for begin, (solved_m, flown) in lengths.items() if flown > 0.0}
+
+
+def _fill(row: FinalRow, placed: PlacedCamera, frame: LocalFrame, r_b_c: np.ndarray) -> None:
     r_w_c, p = placed.pose.rotation().matrix(), placed.pose.translation()
     cov = tangent_to_world(placed.cov, r_w_c)
     tilt = exp_so3(np.array([*placed.bias[MOUNT_TILT], 0.0]))
@@ -217,6 +229,7 @@ def _fill(row: FinalRow, placed: Placed, frame: LocalFrame, r_b_c: np.ndarray) -
     row.alt_amsl_m = float(p[UP])
     row.sigma_e_m, row.sigma_n_m, row.sigma_u_m = (math.sqrt(float(cov[i, i])) for i in (EAST, NORTH, UP))
     row.cov_en_m2 = float(cov[EAST, NORTH])
+    row.q_w_c, row.cov = numbers(quat_from_rot(r_w_c)), numbers(cov.ravel().tolist())
     row.yaw_deg = math.degrees(yaw_of(r_w_c @ (r_b_c @ tilt).T)) % 360.0
 
 
@@ -288,7 +301,8 @@ def _changes(flight: FlightGraph, found: Smoothed, choice: Choice) -> list[dict[
 
 
 @contextmanager
-def _bar(shown: bool) -> Iterator[Step]:
+def bar(shown: bool) -> Iterator[Step]:
+    """-> progress as a bar on standard error."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not shown, transient=True) as bar:
         tasks: dict[str, Any] = {}

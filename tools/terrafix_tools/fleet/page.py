@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from terrafix_tools.fleet.places import KEYS, Grid, grids, picture, words, worst
+from terrafix_tools.fleet.places import KEYS, PlaceGrid, grids, picture, words, worst
 from terrafix_tools.fleet.query import FleetTables
 from terrafix_tools.pages.charts import Chart, Point
 from terrafix_tools.pages.document import Figure, kit, macros, write_file
@@ -179,7 +179,7 @@ def _places(tables: FleetTables) -> str:
     )
 
 
-def _worst(found: list[Grid]) -> str:
+def _worst(found: list[PlaceGrid]) -> str:
     cells = worst(found, MAX_WORST)
     if not cells:
         return ""

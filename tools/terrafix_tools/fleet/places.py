@@ -59,7 +59,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Grid:
+class PlaceGrid:
     """Cells of ``cell_m`` over one map, ``columns`` by ``rows``."""
 
     map: str | None
@@ -70,14 +70,14 @@ class Grid:
     cells: list[Cell]
 
 
-def grids(tables: FleetTables) -> list[Grid]:
+def grids(tables: FleetTables) -> list[PlaceGrid]:
     """One for each map, those with most frames first."""
     return [_grid(tables, **bounds) for bounds in tables.ask(BOUNDS).objects()]
 
 
 def _grid(
     tables: FleetTables, map: str | None, frames: int, south: float, north: float, west: float, east: float
-) -> Grid:
+) -> PlaceGrid:
     metres_per_lon_deg = METRES_PER_DEG * max(0.01, math.cos(math.radians((south + north) / 2)))
     height_m, width_m = (north - south) * METRES_PER_DEG, (east - west) * metres_per_lon_deg
     longest_m = max(height_m, width_m)
@@ -89,10 +89,10 @@ def _grid(
         Cell(lat_deg=south + (one["y"] + 0.5) * lat_step, lon_deg=west + (one["x"] + 0.5) * lon_step, **one)
         for one in found
     ]
-    return Grid(map, frames, cell_m, columns, rows, cells)
+    return PlaceGrid(map, frames, cell_m, columns, rows, cells)
 
 
-def picture(grid: Grid) -> str:
+def picture(grid: PlaceGrid) -> str:
     """SVG, north up: each cell in the colour of its class, those with few frames small."""
     width, height = max(grid.columns, LEAST_COLUMNS) * PX, grid.rows * PX
     marks = "".join(_mark(cell, grid) for cell in grid.cells)
@@ -107,13 +107,13 @@ def picture(grid: Grid) -> str:
     )
 
 
-def worst(found: list[Grid], count: int) -> list[tuple[Grid, Cell]]:
+def worst(found: list[PlaceGrid], count: int) -> list[tuple[PlaceGrid, Cell]]:
     """Cells with the largest shares of refused frames, and enough frames."""
     all_cells = [(grid, cell) for grid in found for cell in grid.cells if cell.frames >= LEAST_FRAMES and cell.refused]
     return sorted(all_cells, key=lambda pair: (-pair[1].share, -pair[1].frames))[:count]
 
 
-def _mark(cell: Cell, grid: Grid) -> str:
+def _mark(cell: Cell, grid: PlaceGrid) -> str:
     css = next(i for i, (limit, _) in enumerate(CLASSES) if cell.share < limit)
     inset = PX / 3 if cell.frames < LEAST_FRAMES else 0.5
     x, y = cell.x * PX + inset, (grid.rows - 1 - cell.y) * PX + inset

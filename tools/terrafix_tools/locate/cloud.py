@@ -2,12 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from terrafix.estimator.factors.three_view import ThreeViewPose, triangulate
 from terrafix.estimator.state import UP
 from terrafix.messages import Odometry
+from terrafix_tools.finalise.point_cloud import POINTS, read_ply
+from terrafix_tools.finalised import SUMMARY, read_flights
 from terrafix_tools.locate.views import CameraView, FlightViews
 
 Elevation = Callable[[np.ndarray, np.ndarray], np.ndarray | None]  # east, north (N,) [m] -> AMSL (N,) [m], NaN: unknown
@@ -32,6 +35,15 @@ class PointCloud:
         nearest = np.argsort(distance)[:count]
         nearest = nearest[distance[nearest] < radius]
         return PointCloud(self.points_m[nearest], self.sigma_m[nearest]), away[nearest]
+
+
+def finalised_cloud(folder: Path) -> PointCloud | None:
+    """All points that `terrafix finalise` has triangulated, in the axes of its only flight; None: the record in
+    ``folder`` was not finalised. Raises SourceError, EvaluationError."""
+    if len(read_flights(folder / SUMMARY)) != 1 or not (folder / POINTS).is_file():
+        return None
+    points = read_ply(folder / POINTS)
+    return PointCloud(np.column_stack([points[axis] for axis in "xyz"]), points["sigma"].astype(float))
 
 
 def build_cloud(flight: FlightViews, fragment_id: int, elevation: Elevation | None) -> PointCloud:

@@ -8,7 +8,7 @@ import numpy as np
 from terrafix.map.package import MapPackage
 from terrafix_tools.evaluate import read_summary
 from terrafix_tools.flight_map import map_of_flight
-from terrafix_tools.locate.cloud import Elevation, PointCloud, build_cloud
+from terrafix_tools.locate.cloud import Elevation, PointCloud, build_cloud, finalised_cloud
 from terrafix_tools.locate.ground import ground_patch
 from terrafix_tools.locate.position import ObjectPosition, Pixel, check_pixel, locate_object
 from terrafix_tools.locate.views import FlightViews, read_views
@@ -22,8 +22,10 @@ class FlightLocator:
     lat_deg, lon_deg = locator.flight.frame.to_wgs84(*found.p_m[:2])
     """
 
-    def __init__(self, flight: FlightViews, elevation: Elevation | None) -> None:
+    def __init__(self, flight: FlightViews, elevation: Elevation | None, dense: PointCloud | None = None) -> None:
+        """``dense``: cloud of the whole finalised flight."""
         self.flight = flight
+        self._dense = dense
         self.elevation = elevation
         self._clouds: dict[int, PointCloud] = {}
 
@@ -40,7 +42,7 @@ class FlightLocator:
         folder = record if record.is_dir() else record.parent
         package = map_of_flight(folder, map_path, read_summary(folder), flight.header)
         elevation = None if package is None else MapPackage.open(package).bind(flight.frame).elevation
-        return cls(flight, elevation)
+        return cls(flight, elevation, finalised_cloud(folder))
 
     def locate(self, pixels: Sequence[tuple[str, tuple[float, float]]]) -> ObjectPosition:
         """Position of one object. ``pixels``: frame (number or file) and pixel (u, v) of each sighting.
@@ -55,7 +57,9 @@ class FlightLocator:
         return locate_object(seen, patches)
 
     def cloud(self, fragment_id: int) -> PointCloud:
-        """Point cloud of a fragment; empty without one (-1)."""
+        """Point cloud of the finalised flight; else of a fragment, empty without one (-1)."""
+        if self._dense is not None:
+            return self._dense
         if fragment_id not in self._clouds:
             self._clouds[fragment_id] = (
                 build_cloud(self.flight, fragment_id, self.elevation)

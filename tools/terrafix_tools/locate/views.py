@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import UnsetType
 
-from terrafix.core.camera import CameraCalibration, Mount
+from terrafix.core.camera import CameraCalibration, Mount, camera_rotation
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.pose import exp_so3
@@ -23,15 +24,20 @@ from terrafix.estimator.state import (
 )
 from terrafix.messages import (
     CalibrationEstimate,
+    Camera,
     Frame,
     GroundPlane,
     MapMatch,
     NavEstimate,
     Odometry,
     Origin,
+    RefinedPose,
+    Refinement,
     VehicleState,
 )
 from terrafix.recorder.reader import ReadResult, check_format, read_flight
+from terrafix_tools.before_after import FINALISED
+from terrafix_tools.finalised import SUMMARY, read_flights, read_poses
 
 
 @dataclass(frozen=True)
@@ -83,7 +89,8 @@ class FlightViews:
 
 
 def read_views(record: Path) -> FlightViews:
-    """Raises SourceError."""
+    """At the finalised pose of each frame, where there is one beside the record; else at the newest refined one; else
+    at its last estimate. Raises SourceError, EvaluationError."""
     result = ReadResult()
     origin: Origin | None = None
     frames: dict[int, Frame] = {}
@@ -92,6 +99,7 @@ def read_views(record: Path) -> FlightViews:
     grounds: dict[int, GroundPlane] = {}
     calibrations: list[CalibrationEstimate] = []
     triples: list[Odometry] = []
+    refined: dict[int, RefinedPose] = {}
     for _, _, message in read_flight(record, result):
         if isinstance(message, Origin):
             origin = message
@@ -107,6 +115,10 @@ def read_views(record: Path) -> FlightViews:
             calibrations.append(message)
         elif isinstance(message, Odometry) and message.three_view:
             triples.append(message)
+        elif isinstance(message, Refinement):
+            refined |= {
+                pose.frame_id: pose for pose in message.poses if pose.q_w_c is not None and pose.cov is not None
+            }
     check_format(record, result)
     if origin is None or not estimates:
         raise SourceError(f"{record}: the record has no position; was a flight recorded?")
@@ -117,7 +129,37 @@ def read_views(record: Path) -> FlightViews:
         for frame_id, estimate in estimates.items()
         if frame_id in frames
     }
+    for frame_id in views.keys() & refined.keys():
+        views[frame_id] = cameras.at(views[frame_id], refined[frame_id])
+    folder = record if record.is_dir() else record.parent
+    by_time = {round(view.t_ns * 1e-9, 3): frame_id for frame_id, view in views.items()}
+    lens = SolvedLens.of(read_flights(folder / SUMMARY), origin.camera)
+    for row in read_poses(folder):
+        if (finalised := by_time.get(round(row.t_s, 3))) is not None:
+            view = cameras.at(views[finalised], row.pose(finalised))
+            views[finalised] = view if lens is None else replace(view, calibration=lens.on(view.calibration))
     return FlightViews(origin, frame, views, triples, frames, result.header)
+
+
+@dataclass(frozen=True)
+class SolvedLens:
+    """Of a batch solution: focal length over the described one, and radial coefficient."""
+
+    focal_ratio: float
+    radial_k1: float
+
+    @classmethod
+    def of(cls, flights: list[dict[str, Any]], camera: Camera) -> "SolvedLens | None":
+        """``flights``: of finalised.json. None: no batch solution was kept, and heights are as seen through the
+        described lens."""
+        if len(flights) != 1 or flights[0].get("solution") != FINALISED or not flights[0]["before_after"]:
+            return None
+        after = {row["what"]: row["after"] for row in flights[0]["before_after"]}
+        return cls(after["focal length"] / camera.fx, after["radial coefficient"])
+
+    def on(self, calibration: CameraCalibration) -> CameraCalibration:
+        fx, fy = self.focal_ratio * calibration.fx, self.focal_ratio * calibration.fy
+        return replace(calibration, fx=fx, fy=fy, radial_k1=self.radial_k1)
 
 
 class _Cameras:
@@ -137,7 +179,7 @@ class _Cameras:
         """Camera of the body in ``estimate``, without file and ground plane."""
         mount, cov = Mount.of(self._camera), np.array(estimate.cov).reshape(6, 6)
         calibration = CameraCalibration.of(self._camera)
-        r_w_c = rot_from_quat(estimate.q_w_b) @ mount.r_b_c()
+        r_w_c = camera_rotation(estimate, self._camera)
         shift_m, height_m = np.zeros(2), estimate.agl_m
         learnt = self._nearest(estimate.t_ns)
         if learnt is None:
@@ -145,7 +187,8 @@ class _Cameras:
         else:
             # The camera is known better than the body in it, and the estimate has the covariance of the body.
             cov[WORLD_TILT, WORLD_TILT] -= self._body_sigma_rad**2 * np.eye(2)
-            r_w_c = r_w_c @ exp_so3(np.append(learnt.state[MOUNT_TILT], 0.0))
+            if isinstance(estimate.q_w_c, UnsetType):  # else it has the tilt
+                r_w_c = r_w_c @ exp_so3(np.append(learnt.state[MOUNT_TILT], 0.0))
             calibration = replace(calibration, radial_k1=learnt.state[RADIAL_K1])
             height_m /= focal_scale(self._camera, learnt.state[LOG_HEIGHT_SCALE])
             # The published position has the estimated principal point in it. The same offset turns the rays the other
@@ -166,6 +209,17 @@ class _Cameras:
             ground_m=ground_m,
             fragment_id=estimate.fragment_id,
         )
+
+    def at(self, view: CameraView, pose: RefinedPose) -> CameraView:
+        """``view`` at its refined ``pose``, which has an orientation and a covariance."""
+        assert pose.q_w_c is not None and pose.cov is not None
+        r_w_c, learnt, shift_m = rot_from_quat(pose.q_w_c), self._nearest(view.t_ns), np.zeros(2)
+        if learnt is not None:
+            lens = PrincipalPointFilter(self._camera, learnt.lens)
+            shift_m, _ = lens.shift(view.height_m * r_w_c[HORIZONTAL, HORIZONTAL])
+        e_m, n_m = np.array(self._frame.to_local(pose.lat_deg, pose.lon_deg)) - shift_m
+        up_m = view.p_c_in_w_m[UP] if pose.alt_amsl_m is None else pose.alt_amsl_m
+        return replace(view, p_c_in_w_m=np.array([e_m, n_m, up_m]), r_w_c=r_w_c, cov=np.reshape(pose.cov, (6, 6)))
 
     def _nearest(self, t_ns: int) -> CalibrationEstimate | None:
         if not self._calibrations:

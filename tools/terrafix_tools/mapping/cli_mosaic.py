@@ -23,9 +23,9 @@ def mosaic(
     flown_by: Annotated[str, typer.Option(help="Who has flown it, for the metadata.")] = "",
 ) -> None:
     """The frames of a flight as an orthomosaic, a newer layer for `terrafix map build`."""
-    from terrafix_tools.mapping.orthomosaic.make import Request, make
+    from terrafix_tools.mapping.orthomosaic.make import OrthomosaicRequest, make
 
-    wanted = Request(record, out, frames, map_path, gsd, sigma, date, flown_by)
+    wanted = OrthomosaicRequest(record, out, frames, map_path, gsd, sigma, date, flown_by)
     made = make(wanted, progress=True)
     typer.echo(
         f"{made.frames} frames, {made.covered_m2 / 1e6:.3f} km2 at {made.gsd_m:.2f} m a pixel, CE90 "

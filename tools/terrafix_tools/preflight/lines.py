@@ -5,13 +5,13 @@ from enum import StrEnum
 import msgspec
 
 
-class Status(StrEnum):
+class CheckStatus(StrEnum):
     OK = "ok"
     WARN = "warn"  # flight possible with reduced performance, or the state cannot be determined from here
     FAIL = "fail"  # will not work, or is unsafe
 
 
-class Change(msgspec.Struct, frozen=True, kw_only=True):
+class ParameterChange(msgspec.Struct, frozen=True, kw_only=True):
     """A parameter change that ``--write`` applies."""
 
     name: str
@@ -21,22 +21,22 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
 
 class Line(msgspec.Struct, frozen=True, kw_only=True):
     check: str
-    status: Status
+    status: CheckStatus
     text: str  # current state, and why that is good or bad
     fix: str = ""  # remedy
-    change: Change | None = None
+    change: ParameterChange | None = None
 
 
 def ok(check: str, text: str) -> Line:
-    return Line(check=check, status=Status.OK, text=text)
+    return Line(check=check, status=CheckStatus.OK, text=text)
 
 
 def warn(check: str, text: str, fix: str) -> Line:
-    return Line(check=check, status=Status.WARN, text=text, fix=fix)
+    return Line(check=check, status=CheckStatus.WARN, text=text, fix=fix)
 
 
 def fail(check: str, text: str, fix: str) -> Line:
-    return Line(check=check, status=Status.FAIL, text=text, fix=fix)
+    return Line(check=check, status=CheckStatus.FAIL, text=text, fix=fix)
 
 
 def number(value: float) -> str:

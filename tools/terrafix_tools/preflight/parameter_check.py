@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from terrafix.link.output.selection import LOCAL_FRAME_OUTPUTS
 from terrafix_tools.preflight import forwarding
 from terrafix_tools.preflight.forwarding import SERIALS, mavlink_ports
-from terrafix_tools.preflight.lines import Change, Line, Status, number, ok
+from terrafix_tools.preflight.lines import CheckStatus, Line, ParameterChange, number, ok
 from terrafix_tools.preflight.rules import ALWAYS, EXTERNAL_NAV, GPS_INPUT_RULES, LOCAL_RULES, Context, Rule, Values
 
 SOURCE_SETS = (1, 2, 3)
@@ -40,9 +40,9 @@ def check_parameters(values: Values, context: Context) -> Iterator[Line]:
     yield _identity(context)
 
 
-def proposed_changes(lines: Iterable[Line]) -> list[Change]:
+def proposed_changes(lines: Iterable[Line]) -> list[ParameterChange]:
     """-> one change for each parameter: the first that is proposed."""
-    changes: dict[str, Change] = {}
+    changes: dict[str, ParameterChange] = {}
     for line in lines:
         if line.change is not None:
             changes.setdefault(line.change.name, line.change)
@@ -71,7 +71,7 @@ def _line(rule: Rule, values: Values, context: Context) -> Line:
         status=rule.status,
         text=f"is {number(value)}: {rule.reason}",
         fix="" if new is None else f"set {number(new)}",
-        change=None if new is None else Change(name=name, old=value, new=new),
+        change=None if new is None else ParameterChange(name=name, old=value, new=new),
     )
 
 
@@ -80,16 +80,16 @@ def _source_set(values: Values, outputs: Sequence[str]) -> Line:
     found = [k for k in SOURCE_SETS if values.get(f"EK3_SRC{k}_POSXY") == EXTERNAL_NAV]
     if not found:
         text = f"no EK3_SRCn_POSXY is 6, so that {', '.join(outputs)} is not used"
-        return Line(check="source set", status=Status.FAIL, text=text, fix="set EK3_SRC2_POSXY 6 (and VELXY 6)")
+        return Line(check="source set", status=CheckStatus.FAIL, text=text, fix="set EK3_SRC2_POSXY 6 (and VELXY 6)")
     for k in found:
         if values.get(f"EK3_SRC{k}_YAW") == EXTERNAL_NAV:
             text = f"EK3_SRC{k}_YAW is 6: the attitude that we send is the autopilot's own"
-            return Line(check="source set", status=Status.FAIL, text=text, fix=f"set EK3_SRC{k}_YAW 1")
+            return Line(check="source set", status=CheckStatus.FAIL, text=text, fix=f"set EK3_SRC{k}_YAW 1")
         velocity = values.get(f"EK3_SRC{k}_VELXY") == EXTERNAL_NAV
         if velocity and "odometry" not in outputs:
             text = f"EK3_SRC{k}_VELXY is 6, and VISION_POSITION_ESTIMATE has no velocity"
             return Line(
-                check="source set", status=Status.FAIL, text=text, fix=f"set EK3_SRC{k}_VELXY 0, or use odometry"
+                check="source set", status=CheckStatus.FAIL, text=text, fix=f"set EK3_SRC{k}_VELXY 0, or use odometry"
             )
     return ok("source set", f"{', '.join(map(str, found))} is external navigation")
 
@@ -102,7 +102,7 @@ def _serial(values: Values, baud: int) -> Line:
         return ok("serial port", f"SERIAL{same[0]} speaks MAVLink at {baud} baud")
     port_bauds = ", ".join(f"SERIAL{i} {code:g}" for i, code in ports.items() if code is not None) or "none"
     text = f"no port speaks MAVLink at {baud} baud (MAVLink: {port_bauds})"
-    return Line(check="serial port", status=Status.WARN, text=text, fix="compare link.baud and SERIALn_BAUD")
+    return Line(check="serial port", status=CheckStatus.WARN, text=text, fix="compare link.baud and SERIALn_BAUD")
 
 
 def _identity(context: Context) -> Line:
@@ -111,4 +111,4 @@ def _identity(context: Context) -> Line:
     text = (
         f"ours is {context.link.sysid}, the autopilot's is {context.sysid}: ground stations show us as another vehicle"
     )
-    return Line(check="system id", status=Status.WARN, text=text, fix=f"set link.sysid = {context.sysid}")
+    return Line(check="system id", status=CheckStatus.WARN, text=text, fix=f"set link.sysid = {context.sysid}")

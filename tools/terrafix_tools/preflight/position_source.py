@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from terrafix.core.state_folder import state_folder
 from terrafix.link.gnss.previous_source import PreviousSourceFile
-from terrafix_tools.preflight.lines import Change, Line, Status, number
+from terrafix_tools.preflight.lines import CheckStatus, Line, ParameterChange, number
 from terrafix_tools.preflight.rules import Values
 
 CHECK = "position source"
@@ -21,14 +21,14 @@ def check_lines(sysid: int, values: Values) -> Iterator[Line]:
         if now is not None and now != before:
             yield Line(
                 check=CHECK,
-                status=Status.FAIL,
+                status=CheckStatus.FAIL,
                 text=f"{name} is {number(now)} since a flight that ended on Terrafix; it was {number(before)}",
                 fix="terrafix preflight --restore, or start Terrafix, which restores it while disarmed",
-                change=Change(name=name, old=now, new=before),
+                change=ParameterChange(name=name, old=now, new=before),
             )
 
 
-def changes_to_restore(lines: Iterable[Line]) -> list[Change]:
+def changes_to_restore(lines: Iterable[Line]) -> list[ParameterChange]:
     """-> changes back to what was before; for an autopilot of which no file says that, to what the rules want."""
     lines = list(lines)
     known = [line.change for line in lines if line.check == CHECK and line.change is not None]

@@ -13,12 +13,12 @@ from terrafix.core.config import Config, load
 from terrafix.core.errors import LinkError, OutputError, UsageError
 from terrafix_tools.preflight import computer, ground, position_source, vehicle
 from terrafix_tools.preflight.autopilot import Autopilot
-from terrafix_tools.preflight.lines import Change, Line, Status, fail, number
+from terrafix_tools.preflight.lines import CheckStatus, Line, ParameterChange, fail, number
 from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.position_source import changes_to_restore
 from terrafix_tools.preflight.rules import Context
 
-MARKS = {Status.OK: "ok  ", Status.WARN: "warn", Status.FAIL: "FAIL"}
+MARKS = {CheckStatus.OK: "ok  ", CheckStatus.WARN: "warn", CheckStatus.FAIL: "FAIL"}
 
 
 class Preflight(msgspec.Struct, frozen=True, kw_only=True):
@@ -26,7 +26,7 @@ class Preflight(msgspec.Struct, frozen=True, kw_only=True):
 
     ready: bool
     lines: list[Line]
-    written: list[Change] = []
+    written: list[ParameterChange] = []
     saved_to: str = ""  # file with the previous values of the written parameters
 
 
@@ -80,14 +80,14 @@ class _Checks:
     """State of a run. ``mission``: mission file to check; None: none is known. ``choose``: which changes to make."""
 
     mission: Path | None
-    choose: Callable[[list[Line]], list[Change]]
+    choose: Callable[[list[Line]], list[ParameterChange]]
     lines: list[Line] = field(default_factory=list)
-    written: list[Change] = field(default_factory=list)
+    written: list[ParameterChange] = field(default_factory=list)
     saved_to: str = ""
 
     def result(self) -> Preflight:
         return Preflight(
-            ready=all(line.status is not Status.FAIL for line in self.lines),
+            ready=all(line.status is not CheckStatus.FAIL for line in self.lines),
             lines=self.lines,
             written=self.written,
             saved_to=self.saved_to,
@@ -158,14 +158,14 @@ def _parameter_lines(autopilot: Autopilot, context: Context) -> list[Line]:
     return [*position_source.check_lines(autopilot.sysid, values), *check_parameters(values, context)]
 
 
-def _confirmed(changes: list[Change]) -> bool:
+def _confirmed(changes: list[ParameterChange]) -> bool:
     typer.echo("\nThese parameters of the autopilot will be set:")
     for change in changes:
         typer.echo(f"  {change.name:<16} {number(change.old)} -> {number(change.new)}")
     return typer.confirm("Set them?", default=False)
 
 
-def _save(changes: list[Change], out: Path) -> Path:
+def _save(changes: list[ParameterChange], out: Path) -> Path:
     """Saves the previous values as a parameter file before anything is set. Raises OutputError."""
     path = out / f"parameters-before-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}.param"
     try:
@@ -177,12 +177,13 @@ def _save(changes: list[Change], out: Path) -> Path:
 
 
 def _print_summary(result: Preflight) -> None:
-    count = {status: sum(line.status is status for line in result.lines) for status in Status}
+    count = {status: sum(line.status is status for line in result.lines) for status in CheckStatus}
     if result.written:
         typer.echo(f"\n{len(result.written)} parameters set; their previous values are in {result.saved_to}")
         typer.echo("Restart the autopilot: some take effect only then.")
     typer.echo(
-        f"\n{count[Status.OK]} ok, {_plural(count[Status.WARN], 'warning')}, {_plural(count[Status.FAIL], 'failure')}"
+        f"\n{count[CheckStatus.OK]} ok, {_plural(count[CheckStatus.WARN], 'warning')}, "
+        f"{_plural(count[CheckStatus.FAIL], 'failure')}"
     )
 
 

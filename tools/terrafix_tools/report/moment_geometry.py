@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.core.camera import CameraCalibration, Mount
+from terrafix.core.camera import CameraCalibration, camera_rotation
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.messages import MapMatch, MapPose, Origin
 from terrafix_tools.report.moment_record import FrameRecord
@@ -66,7 +66,7 @@ def estimated_pose(record: FrameRecord, origin: Origin) -> Pose | None:
     """The camera pose as published, else as predicted; None without both."""
     if (estimate := record.estimate) is not None:
         e_m, n_m = LocalFrame(origin.lat_deg, origin.lon_deg).to_local(estimate.lat_deg, estimate.lon_deg)
-        r_w_c = rot_from_quat(estimate.q_w_b) @ Mount.of(origin.camera).r_b_c()
+        r_w_c = camera_rotation(estimate, origin.camera)
         up_m = estimate.alt_amsl_m
         return Pose(np.array([e_m, n_m, up_m]), r_w_c, up_m - estimate.agl_m)
     if (predicted := record.prediction) is not None:

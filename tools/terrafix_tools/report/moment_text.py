@@ -12,6 +12,7 @@ T = TypeVar("T")
 VERDICTS = {
     Verdict.ACCEPTED: "accepted",
     Verdict.BAD_IMAGE: "the picture is unreadable",
+    Verdict.NO_GROUND: "the gimbal looks away from the ground",
     Verdict.OVERTAKEN: "left out, the computer was too slow",
     Verdict.STALLED: "the camera repeats an earlier picture",
     Verdict.NO_FEATURES: "nothing in the picture to follow",

@@ -12,6 +12,7 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import (
     EkfDeadReckoning,
     Frame,
+    GimbalAttitude,
     GnssInitialPosition,
     Health,
     Imu,
@@ -26,7 +27,7 @@ from terrafix_tools.log.edit import origin_of
 
 ALL_FRAMES = "all"  # of [recorder] frames
 # What the replayed processes receive from others, beside telemetry.
-OTHERS = (EkfDeadReckoning, GnssInitialPosition, Health, PositionHint)
+OTHERS = (EkfDeadReckoning, GimbalAttitude, GnssInitialPosition, Health, PositionHint)
 NOT_RECORDED = "the record does not have the pixels of this frame"
 
 

@@ -1,10 +1,13 @@
-"""Lock monitor: log odds, over frames and poses, that the tracked position is right.
+"""Lock monitor: whether the tracked position is right or the vehicle elsewhere (core/agreement.py), over frames and
+poses.
 
 A belief always has a best position, and a wrong one can score well in single frames. Over many frames the evidence for
 the belief as a whole is lower at a wrong position, and no camera pose is found.
 """
 
-import numpy as np
+import math
+
+from terrafix.core.agreement import Agreement, Cause, Range
 
 START_LOG_ODDS = 6.0  # log odds of a start coordinate: one in 400 is wrong by far more than its 1-sigma [tuned]
 # upper bound for a position confirmed by poses; bare ground or an outdated map may follow for a kilometre [tuned]
@@ -16,8 +19,6 @@ LOCK_NULL_GAIN = 3.0
 # the next one over the same kind of ground is not independent: a copter that climbed over fields was right through six
 # full observations of -2, and twice as many must not outweigh a start. [measured: this comment]
 MIN_GAIN, MAX_GAIN = -0.4, 2.0
-# log odds of 5 %: below it a 95 % ellipse around the position would not hold 95 % [spec: ln(0.95 / 0.05)]
-DOUBT_LOG_ODDS = 2.94
 # Evidence of a pose by its number of inliers. On nine flights and maps a pose was found at 70 right places in 25 to 90
 # % of the frames, with 20 inliers in the median, and at 930 wrong places in 0.5 %, with 9 to 11 inliers (one had 20).
 # [measured: docs/search.md]
@@ -28,7 +29,12 @@ WIDE_SIGMA, WIDE_SIGMA_M = 0.5, 40.0
 
 class LockMonitor:
     def __init__(self) -> None:
-        self.log_odds = START_LOG_ODDS
+        self.agreement = Agreement({Cause.ELSEWHERE: Range(-START_LOG_ODDS, -MAX_LOG_ODDS, math.inf)})
+
+    @property
+    def log_odds(self) -> float:
+        """That the position is right."""
+        return -self.agreement.log_odds[Cause.ELSEWHERE]
 
     @property
     def lost(self) -> bool:
@@ -38,7 +44,7 @@ class LockMonitor:
     @property
     def wrong_probability(self) -> float:
         """Probability that the position is wrong; 0 while it is too small to matter in the covariance."""
-        return 0.0 if self.log_odds > DOUBT_LOG_ODDS else 1.0 / (1.0 + float(np.exp(self.log_odds)))
+        return self.agreement.weight(Cause.ELSEWHERE)
 
     def update(
         self, evidence_nats: float, weight: float, new: float, inliers: int, sigma_m: float, agl_m: float
@@ -53,10 +59,8 @@ class LockMonitor:
         """
         is_wide = has_wide_sigma(sigma_m, agl_m)
         least, most = (0.0, START_LOG_ODDS) if is_wide else (MIN_GAIN * new, MAX_LOG_ODDS)
-        self.log_odds += min(max(evidence_nats - LOCK_NULL_GAIN * weight, least), MAX_GAIN * weight)
-        if inliers:
-            self.log_odds += weight * pose_gain(inliers)
-        self.log_odds = min(self.log_odds, most)
+        gain = min(max(evidence_nats - LOCK_NULL_GAIN * weight, least), MAX_GAIN * weight) + weight * pose_gain(inliers)
+        self.agreement.begin(Cause.ELSEWHERE, -min(self.log_odds + gain, most))
 
 
 def has_wide_sigma(sigma_m: float, agl_m: float) -> bool:

@@ -1,4 +1,4 @@
-"""Sequential test of a relocalized place over new ground: is the vehicle there, or nowhere on this map?
+"""Sequential test of a relocalized place over new ground: is the vehicle there, or elsewhere (core/agreement.py)?
 
 A sequential probability ratio test (Wald, "Sequential tests of statistical hypotheses", 1945) in martingale form. A
 frame counts by the share of ground that the search has not used. On wrong ground it multiplies the odds by a factor
@@ -13,6 +13,7 @@ from terrafix.anchor.matching.frame_matcher import View
 from terrafix.anchor.verification.hypothesis_tracker import NEW_EVIDENCE, TRACK_LLR_MAX, HypothesisTracker
 from terrafix.anchor.verification.lock_monitor import MIN_GAIN, START_LOG_ODDS
 from terrafix.anchor.verification.place_verifier import FINE_CELL_PER_AGL, PlaceVerifier
+from terrafix.core.agreement import Agreement, Cause, Range
 from terrafix.core.node import Image
 from terrafix.map.null_model import Tail
 
@@ -43,22 +44,22 @@ class Probation:
         self._verifier: PlaceVerifier = tracker.verifier
         self._null = tracker.null
         self._frame_tail = frame
-        self._log_odds = PRIOR_LOG_ODDS
+        self._agreement = Agreement({Cause.ELSEWHERE: Range(-PRIOR_LOG_ODDS, -math.inf, math.inf)})
         self._stretch_m = NEW_EVIDENCE * agl_m
         self._path_m = 0.0  # since new ground was last counted
 
     @property
     def wrong_probability(self) -> float:
         """Probability that the place is wrong."""
-        return 1.0 / (1.0 + math.exp(self._log_odds))
+        return self._agreement.probability(Cause.ELSEWHERE)
 
     @property
     def passed(self) -> bool:
-        return self._log_odds >= PASS_LOG_ODDS
+        return -self._agreement.log_odds[Cause.ELSEWHERE] >= PASS_LOG_ODDS
 
     @property
     def failed(self) -> bool:
-        return self._log_odds <= FAIL_LOG_ODDS
+        return -self._agreement.log_odds[Cause.ELSEWHERE] <= FAIL_LOG_ODDS
 
     def predict(self, path_m: float) -> None:
         """``path_m``: length by odometry since the frame before."""
@@ -70,5 +71,6 @@ class Probation:
         found = None if view is None else self._verifier.verify(image, view, FINE_CELL_PER_AGL)
         sigmas = None if found is None else self._null.sigmas(found.consensus, fine=True)
         gain = MIN_GAIN if sigmas is None else log_e_value(self._frame_tail.log_probability(sigmas))
-        self._log_odds += min(self._path_m / self._stretch_m, 1.0) * min(max(gain, MIN_GAIN), TRACK_LLR_MAX)
+        nats = min(self._path_m / self._stretch_m, 1.0) * min(max(gain, MIN_GAIN), TRACK_LLR_MAX)
+        self._agreement.add(Cause.ELSEWHERE, -nats)
         self._path_m = 0.0

@@ -5,7 +5,7 @@ logging computer's clock are repaired (``log_clock``)."""
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,15 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from terrafix.core.errors import SourceError
+from terrafix.core.mavlink import gimbal
 from terrafix.core.mavlink.airspeed import AirspeedReader
+from terrafix.core.mavlink.gimbal import GimbalReader
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
 from terrafix.core.mavlink.imu import MAX_BOOT_US, ImuStreamSelector, boot_ns, imu_readings
 from terrafix.core.mavlink.log_clock import Jump, repaired
 from terrafix.core.mavlink.log_records import address, payload, read_records, record, sequence
 from terrafix.core.mavlink.vehicles import ARMED_FLAG, HeardVehicle, choose_vehicle, firmware_of
-from terrafix.messages import Imu, ImuSample, VehicleState
+from terrafix.messages import GimbalAttitude, Imu, ImuSample, VehicleState
 
 __all__ = ["TelemetryLog", "is_tlog", "read_imu", "read_tlog", "record"]
 
@@ -92,13 +94,18 @@ class TelemetryLog:
         self.jumps, self.damaged_stamps = clock.jumps, clock.damaged_stamps
         self._times_us = clock.times_us
         self.t0_us = clock.times_us[0] if t0_us is None else t0_us
+        self.clock = "arrival times of its records"
+        self.zero = "the first record of the log" if t0_us is None else "[telemetry] tlog_t0_us"
 
-    def messages(self, wanted: set[int]) -> Iterator[tuple[int, Any]]:
-        """(time [us since 1970], message) for all ``wanted`` message ids of the vehicle's autopilot."""
+    def messages(self, wanted: Set[int]) -> Iterator[tuple[int, Any]]:
+        """(time [us since 1970], message) for all ``wanted`` message ids of the vehicle's autopilot; those of gimbals
+        also of its gimbals."""
         for t_us, packet, (system_id, component_id, message_id) in zip(
             self._times_us, self._packets, self._addresses, strict=True
         ):
-            if component_id == AUTOPILOT_COMPONENT and system_id == self.system_id and message_id in wanted:
+            by_gimbal = component_id in gimbal.GIMBAL_COMPONENTS and message_id in gimbal.MESSAGE_IDS
+            ours = system_id == self.system_id and (component_id == AUTOPILOT_COMPONENT or by_gimbal)
+            if ours and message_id in wanted:
                 message = self._decoded(packet)
                 if message is not None:
                     yield t_us, message
@@ -119,6 +126,13 @@ class TelemetryLog:
         the samples keep their boot time plus a constant offset: the least difference between arrival and boot time in
         the log, that of the packet with the least latency."""
         return _inertial(self.t0_us, self.messages(_INERTIAL))
+
+    @cached_property
+    def gimbal(self) -> list[GimbalAttitude]:
+        """Of the vehicle's gimbal, in time order; times, those of arrival, as in ``states``."""
+        reader = GimbalReader()
+        timed = ((message, (t_us - self.t0_us) * 1000) for t_us, message in self.messages(gimbal.MESSAGE_IDS))
+        return [attitude for one in timed if (attitude := reader.take(*one)) is not None]
 
     def notes(self) -> list[str]:
         """Which vehicle was chosen and what was repaired, in words."""

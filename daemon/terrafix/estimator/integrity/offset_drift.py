@@ -25,12 +25,23 @@ def predicted(mass: np.ndarray, dt_s: float, hazards: Hazards) -> np.ndarray:
     """``mass`` (R, L) after ``dt_s``."""
     if dt_s <= 0.0:
         return mass
-    moved = [_shifted(row, rate * dt_s / STEP_S) for row, rate in zip(mass, RATES, strict=True)]
-    constant, drifting = moved[0], np.array(moved[1:])
-    drift, jump, stop = (1.0 - float(np.exp(-rate * dt_s)) for rate in (hazards.drift_hz, hazards.jump_hz, STOP_HZ))
-    any_other = jump * float(constant.sum()) / len(GRID_S)
-    stays = (1.0 - drift - jump) * constant + stop * drifting.sum(axis=0) + any_other
-    return np.vstack([stays, (1.0 - stop) * drifting + drift * constant / len(drifting)])
+    moved = np.array([_shifted(row, rate * dt_s / STEP_S) for row, rate in zip(mass, RATES, strict=True)])
+    after = transitions(dt_s, hazards).T @ moved
+    jump = _chance(hazards.jump_hz, dt_s)
+    after[0] += jump * (float(moved[0].sum()) / len(GRID_S) - moved[0])
+    return np.asarray(after)
+
+
+def transitions(dt_s: float, hazards: Hazards) -> np.ndarray:
+    """(R, R): probability of the rate of the column ``dt_s`` after that of the row."""
+    drift, stop = _chance(hazards.drift_hz, dt_s), _chance(STOP_HZ, dt_s)
+    matrix = (1.0 - stop) * np.eye(len(RATES))
+    matrix[0], matrix[1:, 0], matrix[0, 0] = drift / (len(RATES) - 1), stop, 1.0 - drift
+    return matrix
+
+
+def _chance(hz: float, dt_s: float) -> float:
+    return 1.0 - float(np.exp(-hz * dt_s))
 
 
 def _shifted(row: np.ndarray, cells: float) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Position as a Gaussian mixture: the graph's estimate, other positions that the map supports, and anywhere.
+"""Position as one Gaussian mixture, whose weights sum to one: the graph's estimate, and what the vehicle's position may
+be otherwise by each cause of core/agreement.py. What the anchor adds ("anywhere") comes weighted already.
 
 The heaviest component is published, with the second moments of the mixture about it. The mean of two separate places
 would be neither of them (Gaussian sum filter: Alspach and Sorenson 1972)."""
@@ -7,10 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from terrafix.core.agreement import Agreement, Cause
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.core.pose import positive_part
 from terrafix.estimator.integrity.alternative_position import AlternativePosition
-from terrafix.estimator.integrity.map_consistency import MapConsistency
+from terrafix.estimator.integrity.other_ground import OtherGround
 from terrafix.messages import BeliefSummary, Origin, SearchResult, Verdict
 
 # Share of the height above ground. With a smaller 1-sigma, map poses have placed the graph. A mode of the belief
@@ -48,17 +51,22 @@ class PositionHypotheses:
         searched = origin is not None and origin.start_sigma_m > SEARCH_START_SIGMA_M
         self._start_sigma_m = origin.start_sigma_m if origin is not None and searched else 0.0
         self.anywhere_m = 0.0
-        self.other = AlternativePosition()
-        self.map_consistency = MapConsistency()
+        self.use(Agreement())
         self._modes: tuple[Component, ...] = ()  # of the anchor's belief, heaviest first
         self._belief: Component | None = None  # moments of the whole belief, while no pose has placed the graph
         self._estimate_cov_m2 = np.zeros((2, 2))  # of the estimate that modes and belief were compared with
 
+    def use(self, agreement: Agreement) -> None:
+        """``agreement``: of the flight, whose description may have been judged before this graph began."""
+        self._agreement = agreement
+        self._agreement.forget(Cause.ELSEWHERE, Cause.OTHER_GROUND)
+        self.other, self.other_ground = AlternativePosition(agreement), OtherGround(agreement)
+
     @property
     def is_multimodal(self) -> bool:
         """Whether the published position may differ from the estimate, or its covariance is inflated by the map."""
-        multimodal = bool(self._modes) or self._belief is not None or self.other.probability > 0.0
-        return multimodal or self.map_consistency.variance_m2 > 0.0
+        multimodal = bool(self._modes) or self._belief is not None
+        return multimodal or any(self._agreement.weight(cause) > 0.0 for cause in (Cause.ELSEWHERE, Cause.OTHER_GROUND))
 
     def on_match(self, verdict: Verdict, search: SearchResult) -> str:
         """-> detail of the verdict on a match that is LOST; empty for any other."""
@@ -90,25 +98,27 @@ class PositionHypotheses:
 
     def on_relocalized(self) -> None:
         """A search over several frames has found the position: what matches said before does not count."""
-        self.other, self.map_consistency = AlternativePosition(), MapConsistency()
+        self.use(self._agreement)
 
     def on_reset(self, anywhere_m: float) -> None:
         """The graph was reset to a map match. ``anywhere_m``: not 0 while the anchor still verifies that place."""
         self.on_match_accepted()
         self.anywhere_m = anywhere_m
 
-    def claim(self, cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def claim(self, cov: np.ndarray, path_error_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """-> offset (2,) of the published position from the estimate, and its covariance (6, 6), from ``cov`` (6, 6) of
-        the estimate; east and north first."""
+        the estimate; east and north first. ``path_error_m``: position error by a wrong description."""
         cov = cov.copy()
         offset_m, moments_m2, own_weight = (
             self._moments_with_belief(cov[:2, :2]) if self._belief else self._moments_with_modes(cov[:2, :2])
         )
+        right = 1.0 - sum(self._agreement.weight(cause) for cause in Cause)
         # Only within the estimate's own component are position, height and attitude correlated.
-        cov[:2, 2:] *= own_weight
-        cov[2:, :2] *= own_weight
-        anywhere_m2 = max(self.anywhere_m, self._start_sigma_m) ** 2 + self.map_consistency.variance_m2
-        cov[:2, :2] = moments_m2 + self.other.inflation_m2() + anywhere_m2 * np.eye(2)
+        cov[:2, 2:] *= right * own_weight
+        cov[2:, :2] *= right * own_weight
+        wrong_m2 = self._agreement.weight(Cause.DESCRIPTION) * path_error_m**2 + self.other_ground.variance_m2
+        anywhere_m2 = max(self.anywhere_m, self._start_sigma_m) ** 2
+        cov[:2, :2] = right * moments_m2 + self.other.moments_m2() + (wrong_m2 + anywhere_m2) * np.eye(2)
         return offset_m, cov
 
     def _moments_with_modes(self, estimate_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -141,5 +151,4 @@ class PositionHypotheses:
 
     def _propagated(self, component: Component, estimate_m2: np.ndarray) -> Component:
         """``component``, from an earlier frame, widened by the growth of the estimate's covariance since then."""
-        values, axes = np.linalg.eigh(estimate_m2 - self._estimate_cov_m2)
-        return replace(component, cov_m2=component.cov_m2 + (axes * np.maximum(values, 0.0)) @ axes.T)
+        return replace(component, cov_m2=component.cov_m2 + positive_part(estimate_m2 - self._estimate_cov_m2))

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
-from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_S2, Hazards, predicted
+from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_S2, Hazards, predicted, transitions
+from terrafix.estimator.integrity.velocity_evidence import VelocityEvidence
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.monitors.levelling import ACCELERATION_SIGMA_MPS2
 from terrafix.estimator.monitors.visual_motion import MIN_DOWN, MIN_PAIRS
@@ -38,6 +39,9 @@ NOISE_MEMORY = 50.0  # comparisons: 20 s [spec: twice attitude_slow_s of the sim
 INDEPENDENT_SHARE = 0.5  # of the comparisons: two consecutive ones share a frame [tuned]
 # Least share of the noise that the images have. Without a limit two of three healthy flights had a false offset.
 MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
+# Variance of a position by images over that of its change in a span, which a third would be if attitudes were white.
+CORRELATED = 4.0  # [measured: docs/decisions/058]
+MAX_GAP_S = 2.0  # s between two velocities that are compared [spec: the slowest camera, a frame in two seconds]
 MAX_NATS = 6.0  # of one comparison: twice MAX_STEP of the monitors [spec: monitors/cusum.py]
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
 APPLY_MAX_SIGMA_S = 0.25  # s: largest 1-sigma of an offset that is applied [tuned]
@@ -96,6 +100,7 @@ class TimeOffset:
         self._chain: dict[int, _Levelled] = {}
         self._before: _Levelled | None = None
         self._velocity: _Velocity | None = None
+        self._rate = VelocityEvidence()
         self._prior_sigma_s = STAMP_SIGMA_S
         self._mass = _prior(STAMP_SIGMA_S)  # at ``_at_ns``
         self._at_ns: int | None = None  # stamp of the newest frame that was compared ...
@@ -226,8 +231,28 @@ class TimeOffset:
             jump, floor = _jump(slower, faster, view.agl_m, telemetry)
             log = log + self._log_likelihood(1, jump, 0.5 * (faster.mount2 + slower.mount2), floor, 2)
         since_s = 0.0 if self._at_ns is None else (view.t_ns - self._at_ns) * 1e-9
-        mass = predicted(self._mass, since_s, self._hazards) * np.exp(np.maximum(log - log.max(), -MAX_NATS))
+        rate = self._rate_log_likelihood(slower, faster, since_s, view.agl_m, telemetry)
+        mass = predicted(self._mass, since_s, self._hazards)
+        for part in (log, rate[:, None]):
+            mass *= np.exp(np.maximum(part - part.max(), -MAX_NATS))
         self._mass, self._at_ns = mass / mass.sum(), view.t_ns
+
+    def _rate_log_likelihood(
+        self, before: _Velocity | None, now: _Velocity, since_s: float, agl_m: float, telemetry: Telemetry
+    ) -> np.ndarray:
+        """(R,) of the velocity that images show at the most probable offset. Zero where nothing measures how the
+        vehicle's changed."""
+        change_mps = None
+        if before is not None and since_s < MAX_GAP_S:
+            change_mps = telemetry.velocity_changes(before.middle_ns, now.middle_ns, GRID_S)
+        if change_mps is None:
+            self._rate.forget()
+            change_mps = np.zeros(len(GRID_S))
+        at, rates = int(np.argmax(self._mass.sum(axis=0))), self._mass.sum(axis=1)
+        moved_m, change = complex(now.mean[at]) * now.span_s * agl_m, complex(change_mps[at])
+        noise_m2 = (CORRELATED * self._noise[1] + now.mount2[at]) * (now.span_s * agl_m) ** 2
+        joint = rates[:, None] * transitions(since_s, self._hazards)
+        return self._rate.update(joint, moved_m, now.span_s, noise_m2, change)
 
     def _levelled(self, view: _View, telemetry: Telemetry) -> _Levelled | None:
         """None where attitudes do not cover the grid."""

@@ -16,8 +16,12 @@ import numpy as np
 from terrafix.core.geodesy import euler_from_rot, rot_w_b
 from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.core.pose import exp_so3
-from terrafix.estimator.measurements.attitude_height import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
-from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
+from terrafix.estimator.measurements.telemetry_buffer import (
+    TURN_UNSEEN_RAD,
+    UNKNOWN_ATTITUDE_RAD,
+    Attitude,
+    Telemetry,
+)
 from terrafix.estimator.models.motion_model import TILT_CORRELATION_S, WorldAcceleration
 
 # Of a rotation without the gyroscopes, what is no wrong correction: gyroscope bias hours after calibration (InvenSense
@@ -70,9 +74,14 @@ class AhrsCorrectionMonitor:
         self._removed.append((t_ns, out))
         attitude = self._telemetry.at(t_ns)
         righted_rad = math.hypot(
-            self._extra_tilt_sigma_rad(t_ns * 1e-9, tilt_sigma_rad), attitude.stale * UNKNOWN_ATTITUDE_RAD
+            attitude.righted_rad,
+            self._extra_tilt_sigma_rad(t_ns * 1e-9, tilt_sigma_rad),
+            attitude.stale * UNKNOWN_ATTITUDE_RAD,
         )
-        attitude = replace(attitude, righted_rad=righted_rad, turned_rad=attitude.stale * TURN_UNSEEN_RAD)
+        turned_rad = math.hypot(attitude.turned_rad, attitude.stale * TURN_UNSEEN_RAD)
+        attitude = replace(attitude, righted_rad=righted_rad, turned_rad=turned_rad)
+        if attitude.vehicle is not None:  # a gimbal levels by gyroscopes of its own
+            out = out * (0.0, 0.0, 1.0)
         if not out.any() or attitude.yaw_rad is None or attitude.pitch_rad is None or attitude.roll_rad is None:
             return attitude
         r_w_b = exp_so3(-out) @ rot_w_b(attitude.yaw_rad, attitude.pitch_rad, attitude.roll_rad)

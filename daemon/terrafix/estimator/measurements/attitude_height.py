@@ -7,16 +7,13 @@ from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b, yaw_of
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.factors.attitude_height import attitude_height_factor
-from terrafix.estimator.measurements.telemetry_buffer import Attitude
+from terrafix.estimator.measurements.telemetry_buffer import UNKNOWN_ATTITUDE_RAD, Attitude
 from terrafix.estimator.state import HEADING, MOUNT_TILT_X, MOUNT_TILT_Y
 from terrafix.messages import Origin
 
 UNKNOWN_RAD = 3.0  # 1-sigma of an unreported heading [tuned]
-TURN_UNSEEN_RAD = 0.3  # 1-sigma of its change up to an unseen frame [tuned]
-# 1-sigma of unreported roll and pitch: a copter in cruise tilts by 10 to 20 degrees, a plane banks as much in a turn
-# ...
-UNKNOWN_ATTITUDE_RAD = np.radians(8.0)  # [tuned]
-# ... for about this long in one direction: the level attitude counts once in this time, at any frame rate.
+# A vehicle leans in one direction (UNKNOWN_ATTITUDE_RAD) for about this long: a level attitude that stands for an
+# unreported one counts once in this time, at any frame rate.
 LEAN_S = 5.0  # [tuned]
 DEFAULT_AGL_M = 120.0  # of an unreported height: the usual ceiling of small drones ... [spec: EU and FAA ceiling]
 DEFAULT_AGL_SIGMA_M = 50.0  # ... and wide enough for all of them [tuned]
@@ -29,9 +26,10 @@ class MountedCamera:
         self._origin = origin
         self._r_b_c = Mount.of(origin.camera).r_b_c()
         self._tilt_reported = False  # the autopilot reports roll and pitch
+        self._r_p_b = np.eye(3)  # of the newest frame: from the vehicle to what the camera is fixed to
 
     def yaw_rad(self, r_w_c: np.ndarray) -> float:
-        """Heading of the body, the mount taken as nominal."""
+        """Heading of what the camera is fixed to, the mount taken as nominal."""
         return yaw_of(r_w_c @ self._r_b_c.T)
 
     def expected(self, attitude: Attitude, bias: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
@@ -63,6 +61,7 @@ class MountedCamera:
         height = DEFAULT_AGL_SIGMA_M * 20 if attitude.agl_m is None else max(origin.agl_sigma_m, 0.5)
         up = (origin.ground_amsl_m or 0.0) + (DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m)
         r_w_b = rot_w_b(yaw_rad, attitude.pitch_rad or 0.0, attitude.roll_rad or 0.0)
+        self._r_p_b = np.eye(3) if attitude.vehicle is None else r_w_b.T @ rot_w_b(*attitude.vehicle)
         sigmas = np.array([tilt, tilt, yaw_sigma, height])
         return attitude_height_factor(*keys, sigmas, r_w_b, self._r_b_c, up, ground_m)
 
@@ -73,9 +72,9 @@ class MountedCamera:
         return body_sigma_rad(self._origin, tilt_reported=self._tilt_reported)
 
     def body(self, r_w_c: np.ndarray, bias: np.ndarray) -> np.ndarray:
-        """R_w_b (3, 3), with the estimated mount."""
+        """R_w_b (3, 3) of the newest frame, with the estimated mount."""
         r_b_c = self._r_b_c @ exp_so3(np.array([bias[MOUNT_TILT_X], bias[MOUNT_TILT_Y], 0.0]))
-        return np.asarray(r_w_c @ r_b_c.T)
+        return np.asarray(r_w_c @ r_b_c.T @ self._r_p_b)
 
 
 def body_sigma_rad(origin: Origin, *, tilt_reported: bool) -> float:

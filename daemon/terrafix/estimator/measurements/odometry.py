@@ -15,17 +15,18 @@ from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture, ViewChange
 from terrafix.estimator.keyframe_view import KeyframeView
-from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.measurements.ground_plane_motion import plane_motion
 from terrafix.estimator.measurements.heading import heading_innovation
 from terrafix.estimator.measurements.keyframe_link import LinkMeasurement, by_link, refused
+from terrafix.estimator.measurements.telemetry_buffer import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
 from terrafix.estimator.state import HEADING, HEIGHT, HORIZONTAL, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import CovarianceMode, Odometry, Verdict
 
-NO_NEW_VIEW = (Verdict.BAD_IMAGE, Verdict.OVERTAKEN, Verdict.STALLED)  # verdicts of vision on frames without a new view
+# Verdicts on frames without a new view of the ground.
+NO_NEW_VIEW = (Verdict.BAD_IMAGE, Verdict.OVERTAKEN, Verdict.STALLED, Verdict.NO_GROUND)
 MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
 HEADING_GATE = 3.0  # sigmas between the turn of a new fragment and the reported heading [tuned]
 
@@ -58,6 +59,13 @@ class GatedOdometry:
     @property
     def fused(self) -> KeyframeMotion | None:
         return self.motion if self.verdict is Verdict.ACCEPTED else None
+
+
+def without_ground(odometry: Odometry) -> Odometry:
+    """Of a frame whose camera looks away from the ground: what it shows is no motion over it."""
+    return Odometry(
+        t_ns=odometry.t_ns, frame_id=odometry.frame_id, keyframe_id=odometry.frame_id, verdict=Verdict.NO_GROUND
+    )
 
 
 class OdometryMeasurement:

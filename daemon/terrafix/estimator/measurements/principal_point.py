@@ -9,8 +9,7 @@ filter stands beside the graph, in which a principal point would shift every pos
 import gtsam
 import numpy as np
 
-from terrafix.core.camera import Mount
-from terrafix.core.geodesy import rot_from_quat
+from terrafix.core.camera import camera_rotation
 from terrafix.estimator.factors.three_view import (
     HUBER_K,
     MAX_SIGMA_RATIO,
@@ -95,7 +94,7 @@ class PrincipalPointFilter:
 
 def graph_shift(published: NavEstimate, camera: Camera, learnt: LensEstimate) -> np.ndarray:
     """(2,): from the camera of the graph to the published position [m]."""
-    r_w_c = rot_from_quat(published.q_w_b) @ Mount.of(camera).r_b_c()
+    r_w_c = camera_rotation(published, camera)
     return PrincipalPointFilter(camera, learnt).shift(published.agl_m * r_w_c[:2, :2])[0]
 
 

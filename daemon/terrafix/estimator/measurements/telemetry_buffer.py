@@ -9,9 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.core.inertial import GRAVITY_MPS2, covers, rotate_to_world
+from terrafix.estimator.measurements.gimbal import GimbalReports, euler_of
 from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.messages import Imu, VehicleState
 
+TURN_UNSEEN_RAD = 0.3  # 1-sigma of the change of an unreported heading up to an unseen frame [tuned]
+# 1-sigma of unreported roll and pitch: a copter in cruise tilts by 10 to 20 degrees, a plane banks as much in a turn
+UNKNOWN_ATTITUDE_RAD = np.radians(8.0)  # [tuned]
 BUFFER_STATES = 400  # 8 s at 50 Hz [tuned]
 # Two minutes at 25 and 50 Hz, for which a camera may fail; 30 s at 200 Hz.
 BUFFER_ATTITUDES, BUFFER_READINGS = 3000, 6000  # [tuned]
@@ -40,6 +44,13 @@ class Attitude:
     righted_rad: float = 0.0  # 1-sigma of the tilt beyond the configured one (ahrs_correction.py)
     turned_rad: float = 0.0  # 1-sigma of the heading beyond the configured one (same)
     stale_s: float = 0.0  # from the nearest report to the frame, beyond half an interval of the slowest stream
+    # Yaw, pitch and roll of the vehicle where the angles above are those of a platform on a gimbal (gimbal.py)
+    vehicle: tuple[float, float, float] | None = None
+    sees_ground: bool = True  # the gimbal does not look away from it
+
+    @property
+    def vehicle_yaw_rad(self) -> float | None:
+        return self.yaw_rad if self.vehicle is None else self.vehicle[0]
 
     @property
     def stale(self) -> float:
@@ -52,6 +63,7 @@ class Attitude:
         return self.armed is False and (self.agl_m is None or self.agl_m < STANDS_BELOW_M)
 
 
+LEANS_RAD = np.radians(2.0)  # twice the 1-sigma of a reported tilt [spec: attitude_sigma_deg]
 _ANGLES = ("yaw_rad", "pitch_rad", "roll_rad")
 _FIELDS = (*_ANGLES, "agl_m", "armed", "airspeed_mps")
 
@@ -62,6 +74,7 @@ class Telemetry:
         self._turns = _Series(BUFFER_ATTITUDES)  # yaw, pitch, roll
         self._forces = _Series(BUFFER_READINGS)  # forward, right, down
         self._rates = _Series(BUFFER_READINGS)  # about the same axes
+        self.gimbal = GimbalReports()
 
     def add(self, state: VehicleState) -> None:
         self._states.append(state)
@@ -75,6 +88,44 @@ class Telemetry:
             self._rates.add(imu.t_ns - before_ns, *rates)
 
     def at(self, t_ns: int) -> Attitude:
+        """What the camera is fixed to at ``t_ns``: the vehicle, or what its gimbal holds (gimbal.py)."""
+        vehicle = self._vehicle_at(t_ns)
+        return self._platform_at(t_ns, vehicle) if self.gimbal.used else vehicle
+
+    def _platform_at(self, t_ns: int, vehicle: Attitude) -> Attitude:
+        """A gimbal that reports nothing, or nothing new while the vehicle leans, holds the stabilised axes level to
+        UNKNOWN_ATTITUDE_RAD; the others lean as the vehicle does."""
+        held, yaw_rad, pitch_rad, roll_rad = self.gimbal.at(t_ns), vehicle.yaw_rad, vehicle.pitch_rad, vehicle.roll_rad
+        body = None if yaw_rad is None or pitch_rad is None or roll_rad is None else (yaw_rad, pitch_rad, roll_rad)
+        platform = replace(vehicle, vehicle=body, sees_ground=held is None or held.sees_ground)
+        angles = np.zeros(3) if held is None else euler_of(held.q[None])[:, 0]
+        if held is not None and held.from_north:
+            yaw_rad = float(angles[0])
+        elif yaw_rad is not None:
+            yaw_rad += float(angles[0])
+        if held is None or held.age_ns > MAX_GAP_NS or self._repeats():
+            lost = replace(platform, yaw_rad=yaw_rad, turned_rad=TURN_UNSEEN_RAD, righted_rad=UNKNOWN_ATTITUDE_RAD)
+            pitches, rolls = (axis not in self.gimbal.stabilised for axis in ("pitch", "roll"))
+            if not (pitches or rolls):
+                return replace(lost, pitch_rad=None, roll_rad=None)
+            return replace(lost, pitch_rad=pitch_rad if pitches else 0.0, roll_rad=roll_rad if rolls else 0.0)
+        return replace(
+            platform,
+            yaw_rad=yaw_rad,
+            pitch_rad=float(angles[1]),
+            roll_rad=float(angles[2]),
+            stale_s=max(vehicle.stale_s, max(0, held.age_ns - MAX_ATTITUDE_GAP_NS // 2) * 1e-9),
+            righted_rad=held.turns_rad,
+            turned_rad=held.turns_rad,
+        )
+
+    def _repeats(self) -> bool:
+        """The gimbal reports no change while the vehicle leans."""
+        since_ns = self.gimbal.unchanged_since_ns
+        turns = None if since_ns is None else self._turns.around(since_ns, self._turns.newest_ns)
+        return turns is not None and bool(np.ptp(turns[1][1:], axis=1).max() > LEANS_RAD)
+
+    def _vehicle_at(self, t_ns: int) -> Attitude:
         """Each field as measured nearest to ``t_ns``; None where there is no value within a second."""
         best: dict[str, tuple[int, float | bool]] = {}
         unsettled = list(_FIELDS)
@@ -140,8 +191,10 @@ class Telemetry:
 
     def attitudes_about(self, t_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """-> R_w_b (N, 3, 3) about times (N,) [ns], as ``turned_about``, and sines of roll and pitch (N,), as complex
-        numbers."""
+        numbers; of what the camera is fixed to."""
         angles = self.turned_about(t_ns)
+        if angles is not None and self.gimbal.used:
+            angles = self.gimbal.angles_about(t_ns, angles[0])
         if angles is None:
             return None
         r_w_b = np.stack([rotate_to_world([*axis], *angles) for axis in np.eye(3)], axis=2)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.core.agreement import Agreement
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_from_quat, yaw_of
 from terrafix.core.pose import exp_so3
@@ -48,7 +49,7 @@ class Finding:
 
 
 class Monitors:
-    """All monitors of the flight that ``origin`` describes."""
+    """All monitors of the flight that ``origin`` describes. ``agreement``: of its positions with the map."""
 
     def __init__(self, origin: Origin) -> None:
         self._origin = origin
@@ -59,7 +60,8 @@ class Monitors:
         self._turns = TurnMonitor(math.radians(origin.yaw_sigma_deg))
         self._levelling = LevellingMonitor()
         self._shape = ShapeMonitor()
-        self._registration = Registration()
+        self.agreement = Agreement()
+        self._registration = Registration(self.agreement)
         heading = math.hypot(HEADING_SIGMA_RAD, math.radians(origin.yaw_sigma_deg))
         self._heading = OffsetMonitor(heading, YAW_NOISE_RAD)
         self._height: OffsetMonitor | None = None  # None until a height is reported
@@ -74,7 +76,12 @@ class Monitors:
         """1-sigma per horizontal axis, to be added to the published covariance."""
         if any(quantity not in REFUSED_PICTURES for quantity in self._reported):
             return max(FAULT_SIGMA_M, self._registration.path_error_m)
-        return self._registration.sigma_m
+        return 0.0
+
+    @property
+    def path_error_m(self) -> float:
+        """Position error by a wrong description that no monitor has named (``Cause.DESCRIPTION``)."""
+        return self._registration.path_error_m
 
     def on_odometry(
         self,

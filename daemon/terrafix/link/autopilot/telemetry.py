@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.clock import NS_PER_MS
 from terrafix.core.mavlink.airspeed import AirspeedReader
+from terrafix.core.mavlink.gimbal import ATTITUDE_MESSAGES, GimbalReader
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
 from terrafix.core.mavlink.imu import IMU_MESSAGES, ImuStreamSelector, boot_ns, imu_readings
 from terrafix.link.admission.boot_clock import WRAP_MS
@@ -18,7 +19,7 @@ from terrafix.link.autopilot.checkpoint import ArmedAutopilot, LinkCheckpoint
 from terrafix.link.autopilot.pressure_height import PressureHeight
 from terrafix.link.mavlink.diagnosis import FIRMWARE_NAMES
 from terrafix.link.mavlink.timesync import TimeSync
-from terrafix.messages import CandidateAttitude, Imu, ImuSample, VehicleState
+from terrafix.messages import CandidateAttitude, GimbalAttitude, Imu, ImuSample, VehicleState
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000  # three heartbeats [tuned]
 SENSOR_TIMEOUT_NS = 1_000_000_000  # an older height or airspeed is not published with an attitude [tuned]
@@ -43,6 +44,7 @@ class TelemetryDecoder:
         self._pressure = PressureHeight()
         self._airspeed: tuple[int, float] | None = None  # (time received, m/s)
         self._airspeed_reader = AirspeedReader()
+        self._gimbal = GimbalReader()
         self._armed: bool | None = None
         self._identity: ArmedAutopilot | None = None
         self._unix_minus_monotonic_ns: int | None = None
@@ -82,6 +84,15 @@ class TelemetryDecoder:
         elif kind == "SYSTEM_TIME" and message.time_unix_usec > 0:
             self._unix_minus_monotonic_ns = message.time_unix_usec * 1000 - now_ns
         return None
+
+    def on_gimbal(self, message: Any, now_ns: int) -> GimbalAttitude | None:
+        """A message of the autopilot, or of a gimbal of its vehicle, whose clock is another one: its time is that of
+        arrival."""
+        t_ns, kind = now_ns, message.get_type()
+        by_autopilot = message.get_srcComponent() == AUTOPILOT_COMPONENT
+        if by_autopilot and kind in ATTITUDE_MESSAGES and kind != "MOUNT_STATUS":
+            t_ns = self.measured_ns(message.time_boot_ms * NS_PER_MS, now_ns)
+        return self._gimbal.take(message, t_ns)
 
     def restore(self, checkpoint: LinkCheckpoint, now_ns: int) -> None:
         """Restores the state from the checkpoint of the previous link process, as if a heartbeat had arrived now."""

@@ -63,6 +63,11 @@ class NoFixReason:
 # The computer was restarted in flight: the start coordinate is the place of take-off, with a small stated sigma.
 STARTED_IN_FLIGHT = NoFixReason("started in flight, and no map fix yet", "the map must confirm the start")
 
+# Disarmed is evidence for standing and no measurement of it: a vehicle on a deck or a truck is disarmed, too.
+ONLY_DISARMED = NoFixReason(
+    "nothing has measured that the start stands, and no map fix yet", "no map fix since the start"
+)
+
 # No map match yet, and no start that is known to 100 m.
 NOT_PLACED = NoFixReason("not found on the map yet", "not found on the map yet")
 

@@ -19,7 +19,8 @@ MIN_RATE_SHARE = 0.7
 MAX_INTERVAL_REQUESTS = 2
 # Hz. ATTITUDE at 25 Hz interpolates turns for the frames and levels the IMU. RAW_IMU at 33 Hz takes 1.3 kB/s; it is the
 # most that a plane delivers: ArduPilot sends nothing faster than 0.8 of its main loop (plane: 50 Hz), in whole loops.
-# Heights at 5 Hz follow the barometer. Receivers at 5 Hz: spoofing is then detected within a second. [tuned]
+# Heights at 5 Hz follow the barometer; between reports at 10 Hz a gimbal that turns by 10 degrees/s turns by one.
+# Receivers at 5 Hz: spoofing is then detected within a second. [tuned]
 STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 25.0,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: 33.0,
@@ -30,6 +31,7 @@ STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5.0,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 1.0,  # whether the EKF uses our position
     mavlink.MAVLINK_MSG_ID_AIRSPEED: 5.0,
+    mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 10.0,
 }
 PX4_EQUIVALENTS = {  # ArduPilot's message -> the one that PX4 sends instead
     mavlink.MAVLINK_MSG_ID_RAW_IMU: mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
@@ -40,6 +42,7 @@ OPTIONAL = {  # their absence is not reported
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,  # not supported by all firmware
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
     mavlink.MAVLINK_MSG_ID_AIRSPEED,  # needs a sensor
+    mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS,  # needs a gimbal
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,  # relative_alt replaces it
 }
 PX4_UNAVAILABLE = {mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE}  # not tested on PX4
@@ -47,7 +50,10 @@ PX4_UNAVAILABLE = {mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE}  # not tested on PX4
 OPTIONAL_ON_PX4 = OPTIONAL | {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT}
 PX4_EXTRA_HZ = {mavlink.MAVLINK_MSG_ID_ALTITUDE: 5.0}  # Hz, on PX4 only [tuned]
 # Requests of a message that was never received: ArduPilot before 4.6 rejects each with a text to the pilot. [tuned]
-MAX_UNANSWERED_REQUESTS = {mavlink.MAVLINK_MSG_ID_AIRSPEED: 2}
+MAX_UNANSWERED_REQUESTS = {
+    mavlink.MAVLINK_MSG_ID_AIRSPEED: 2,
+    mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 2,
+}
 DATA_STREAM_GROUPS = {  # message -> group of REQUEST_DATA_STREAM that contains it (ArduPilot's SRn_ parameters)
     mavlink.MAVLINK_MSG_ID_ATTITUDE: mavlink.MAV_DATA_STREAM_EXTRA1,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: mavlink.MAV_DATA_STREAM_RAW_SENSORS,

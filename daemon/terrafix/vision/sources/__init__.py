@@ -6,6 +6,7 @@ from pathlib import Path
 from terrafix.core.config import SourceSection
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources.contract import UNKNOWN_TIMING, Shot, Source, Timing
+from terrafix.vision.sources.fisheye import pinhole_source
 from terrafix.vision.sources.images import IMAGE_SUFFIXES, is_image_name
 from terrafix.vision.sources.stream_address import is_live
 
@@ -23,13 +24,27 @@ def open_source(
     timing: Timing = UNKNOWN_TIMING,
     wait_for_camera: bool = False,
 ) -> Source:
-    """Opens a flight folder, photos, a video file, or a camera: ``stream_address.is_live``.
+    """Opens a flight folder, photos, a video file, or a camera: ``stream_address.is_live``. Of a fisheye lens the images
+    are those of a pinhole camera (``fisheye.view_of``).
 
     ``start`` (lat_deg, lon_deg) overrides the initial position of the source. ``camera``: a camera description; live
     cameras require it, for photos and videos it overrides theirs. ``rate_hz``: frame rate taken from a video or camera.
     ``timing``: of a camera. ``wait_for_camera``: a missing camera is no error; ``shots`` waits for it (a restart in
     flight).
     Raises SourceError: one line with the problem and the remedy."""
+    return pinhole_source(_open(spec, start, camera, rate_hz, timing, wait_for_camera=wait_for_camera))
+
+
+def _open(
+    spec: str,
+    start: tuple[float, float] | None,
+    camera: Path | None,
+    rate_hz: float,
+    timing: Timing,
+    *,
+    wait_for_camera: bool,
+) -> Source:
+    """``open_source`` with the images as they are stored. Raises SourceError."""
     if not spec.strip():
         raise SourceError(
             "no source given; name a flight folder, photos, a video, /dev/videoN, csi://0, rtsp://..., "

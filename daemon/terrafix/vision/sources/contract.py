@@ -7,9 +7,9 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from terrafix.messages import Frame, Imu, Message, Origin, VehicleState
+from terrafix.messages import Frame, GimbalAttitude, Imu, Message, Origin, VehicleState
 
-TimedMessage = TypeVar("TimedMessage", VehicleState, Imu)
+TimedMessage = TypeVar("TimedMessage", VehicleState, Imu, GimbalAttitude)
 
 
 class Timing(NamedTuple):
@@ -31,7 +31,7 @@ class Shot:
     states: tuple[VehicleState, ...]  # measured since the previous shot, up to this frame, in time order
     image: np.ndarray | None  # (H, W, 3) uint8 BGR
     imu: tuple[Imu, ...] = ()  # IMU samples of the same interval
-    others: tuple[Message, ...] = ()  # what else the processes received in that interval, of a recorded flight
+    others: tuple[Message, ...] = ()  # what else was received in that interval: GimbalAttitude, and of a record more
 
 
 class TelemetryCursor(Generic[TimedMessage]):

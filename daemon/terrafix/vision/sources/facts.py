@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 from terrafix.messages import Camera, Origin, VehicleState
 
 if TYPE_CHECKING:
+    from terrafix.core.autopilot_log.own_log import OwnLog
     from terrafix.core.mavlink.tlog import TelemetryLog
 
 GAP_TIMES = 3.0  # a gap is longer than this many times the median interval
@@ -71,23 +72,23 @@ def rate_facts(times_s: Sequence[float], what: str) -> Iterator[Fact]:
         yield Fact("gaps", f"{len(gaps)} gaps between {what}, the longest {longest_s:.1f} s from {at_s:.1f} s on")
 
 
-def telemetry_facts(states: Sequence[VehicleState], whence: str) -> Iterator[Fact]:
-    """How often height, heading and tilt are stated. ``whence``: file or fields they come from."""
-    for topic, name in (
-        ("height", "agl_m"),
-        ("heading", "yaw_rad"),
-        ("tilt", "roll_rad"),
-        ("airspeed", "airspeed_mps"),
+def telemetry_facts(states: Sequence[VehicleState], whence: str, origin: Origin) -> Iterator[Fact]:
+    """How often height, heading and tilt are stated, and the accuracy that is assumed. ``whence``: file or fields they
+    come from."""
+    for topic, name, sigma in (
+        ("height", "agl_m", f", 1-sigma {origin.agl_sigma_m:g} m"),
+        ("heading", "yaw_rad", f", 1-sigma {origin.yaw_sigma_deg:g} degrees"),
+        ("tilt", "roll_rad", f", 1-sigma {origin.attitude_sigma_deg:g} degrees"),
+        ("airspeed", "airspeed_mps", ""),
     ):
         count = sum(getattr(state, name) is not None for state in states)
         if count or topic != "airspeed":
-            yield Fact(topic, f"{count} values from {whence}" if count else "not stated")
+            yield Fact(topic, f"{count} values from {whence}{sigma}" if count else "not stated")
 
 
-def log_facts(log: "TelemetryLog", stated_zero: bool) -> Iterator[Fact]:
-    """Clock, vehicles and damage of a telemetry log."""
-    zero = "[telemetry] tlog_t0_us" if stated_zero else "the first record of the log"
-    yield Fact("clock", f"{log.path.name}: arrival times of its records; zero is {zero}")
+def log_facts(log: "TelemetryLog | OwnLog") -> Iterator[Fact]:
+    """Clock, vehicles and damage of a log."""
+    yield Fact("clock", f"{log.path.name}: {log.clock}; zero is {log.zero}")
     if len(log.vehicles) == 1:
         yield Fact("vehicles", log.vehicles[0].name())
     for note in log.notes():
@@ -96,5 +97,7 @@ def log_facts(log: "TelemetryLog", stated_zero: bool) -> Iterator[Fact]:
         yield Fact("left out", f"{log.path.name}: holds no attitude, height, heading or airspeed of an autopilot")
     if log.skipped_bytes:
         yield Fact("left out", f"{log.path.name}: {log.skipped_bytes} bytes are damaged or cut off")
+    if log.gimbal:
+        yield Fact("mount", f"{len(log.gimbal)} attitudes of a gimbal from {log.path.name}")
     if log.imu:
         yield Fact("inertial readings", f"{sum(len(batch.samples) for batch in log.imu)} from {log.path.name}")

@@ -1,4 +1,4 @@
-"""Flight folder: flight.toml, frames.csv, frames/ and optionally telemetry.tlog (docs/flight-folder.md).
+"""Flight folder: flight.toml, frames.csv, frames/ and optionally a telemetry log (docs/flight-folder.md).
 
 It may also contain truth.csv, which is not read here."""
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Frame, Imu, Origin, VehicleState
+from terrafix.messages import Frame, GimbalAttitude, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
 from terrafix.vision.sources.facts import (
@@ -41,10 +41,17 @@ class FlightFolder:
         check_heights(folder / "frames.csv", heights_m)
         self._check_files()
         self._check_size()
-        log = folder / "telemetry.tlog"
-        self._log = telemetry_log(log, self._description) if log.is_file() else None
+        stated, self._stated_in = [row.state for row in self._rows if row.state is not None], "frames.csv"
+        table = folder / "telemetry.csv"
+        if table.is_file():
+            stated += [row.state for row in read_table(table, table.name, with_file=False) if row.state is not None]
+            stated.sort(key=lambda state: state.t_ns)
+            self._stated_in += f" and {table.name}"
+        self._stated = stated
+        self._log = telemetry_log(folder / "telemetry", self._description, stated)
         self._states = self._telemetry()
         self._imu: list[Imu] = [] if self._log is None else self._log.imu
+        self._gimbal: list[GimbalAttitude] = [] if self._log is None else self._log.gimbal
 
     def origin(self) -> Origin:
         return self._origin
@@ -59,19 +66,18 @@ class FlightFolder:
         return (self.folder / self._description.map).resolve() if self._description.map else None
 
     def facts(self) -> list[Fact]:
-        description, times_s = self._description, [row.t_ns / 1e9 for row in self._rows]
-        stated = [row.state for row in self._rows if row.state is not None]
+        times_s = [row.t_ns / 1e9 for row in self._rows]
         found = [
             *camera_facts(self._stored, "[camera] of flight.toml"),
             mount_fact(self._stored, "[mount] of flight.toml"),
             start_fact(self._origin, "--start" if self._start_given else "[start] of flight.toml"),
             *rate_facts(times_s, "frames"),
         ]
-        if stated or self._log is None:
-            found += telemetry_facts(stated, "frames.csv")
+        if self._stated or self._log is None:
+            found += telemetry_facts(self._stated, self._stated_in, self._origin)
         if self._log is not None:
-            found += telemetry_facts(self._log.states, self._log.path.name)
-            found += log_facts(self._log, description.telemetry.tlog_t0_us is not None)
+            found += telemetry_facts(self._log.states, self._log.path.name, self._origin)
+            found += log_facts(self._log)
         outside = sum(not -1e9 <= state.t_ns <= self._rows[-1].t_ns for state in self._states)
         if outside and outside == len(self._states):
             found.append(Fact("left out", "all telemetry: none of it lies within the times of the frames"))
@@ -84,8 +90,9 @@ class FlightFolder:
         from_ns = round(from_s * 1e9)
         camera, stored = self._origin.camera, self._stored
         states_of, imu_of = TelemetryCursor(self._states, from_ns), TelemetryCursor(self._imu, from_ns)
+        gimbal_of = TelemetryCursor(self._gimbal, from_ns)
         for frame_id, row in enumerate(self._rows):
-            states, imu = states_of(row.t_ns), imu_of(row.t_ns)
+            states, imu, held = states_of(row.t_ns), imu_of(row.t_ns), gimbal_of(row.t_ns)
             if row.t_ns < from_ns:
                 continue
             image, error = read_image(self.folder / "frames" / row.file, stored.width, stored.height)
@@ -97,7 +104,7 @@ class FlightFolder:
                 height=camera.height,
                 error=error,
             )
-            yield Shot(frame, states, image, imu)
+            yield Shot(frame, states, image, imu, held)
 
     def _check_files(self) -> None:
         table, frames = self.folder / "frames.csv", self.folder / "frames"
@@ -132,12 +139,8 @@ class FlightFolder:
         )
 
     def _telemetry(self) -> list[VehicleState]:
-        """States of frames.csv and telemetry.tlog in time order. A tlog may start before or after the first frame."""
-        states = [row.state for row in self._rows if row.state is not None]
-        if self._log is not None:
-            states += self._log.states
-            states.sort(key=lambda state: state.t_ns)
-        return states
+        """States of tables and log in time order. A log may start before or after the first frame."""
+        return sorted([*self._stated, *(self._log.states if self._log else ())], key=lambda state: state.t_ns)
 
 
 def _is_inside(file: Path, frames: Path, real_frames: Path) -> bool:

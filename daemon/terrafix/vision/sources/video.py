@@ -8,10 +8,11 @@ from pathlib import Path
 import cv2
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Frame, Imu, Origin, VehicleState
+from terrafix.messages import Frame, GimbalAttitude, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
 from terrafix.vision.sources.facts import Fact, camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
+from terrafix.vision.sources.srt import read_srt
 from terrafix.vision.sources.table import read_table
 
 FFMPEG_QUIET = "-8"  # AV_LOG_QUIET; a damaged image would otherwise print one line per block
@@ -35,10 +36,11 @@ class Video:
         self._description = read_description(where)
         self._map_base = where.parent
         self._origin = origin_of(self._description, camera_of(where, self._description), start)
-        log = path.with_suffix(".tlog")
-        self._log = telemetry_log(log, self._description) if log.is_file() else None
-        self._states = self._telemetry()
+        states = self._stated()
+        self._log = telemetry_log(path, self._description, states)
+        self._states = sorted([*states, *(self._log.states if self._log else ())], key=lambda state: state.t_ns)
         self._imu: list[Imu] = [] if self._log is None else self._log.imu
+        self._gimbal: list[GimbalAttitude] = [] if self._log is None else self._log.gimbal
         self._period_s = 1.0 / rate_hz
         capture = self._open()
         self._fps = capture.get(cv2.CAP_PROP_FPS)
@@ -74,10 +76,10 @@ class Video:
             start_fact(self._origin, "--start" if self._start_given else f"[start] of {self._where.name}"),
             Fact("clock", "times of the container"),
             Fact("rate", f"{1 / self._period_s:g} images a second of {self._fps:.3g} ([source] rate_hz)"),
-            *telemetry_facts(self._states, "the telemetry beside the video"),
+            *telemetry_facts(self._states, "the telemetry beside the video", self._origin),
         ]
         if self._log is not None:
-            found += log_facts(self._log, self._description.telemetry.tlog_t0_us is not None)
+            found += log_facts(self._log)
         return found
 
     def close(self) -> None:
@@ -95,6 +97,7 @@ class Video:
         step_s = 1.0 / self._fps if self._fps > 0 else self._period_s
         from_ns = round(from_s * 1e9)
         states_of, imu_of = TelemetryCursor(self._states, from_ns), TelemetryCursor(self._imu, from_ns)
+        gimbal_of = TelemetryCursor(self._gimbal, from_ns)
         frame_id, t_s, due_s = 0, -step_s, 0.0
         while capture.grab():
             container_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
@@ -103,7 +106,7 @@ class Video:
                 continue
             due_s += self._period_s * max(1, math.ceil((t_s + step_s / 2 - due_s) / self._period_s))
             t_ns = round(t_s * 1e9)
-            states, imu = states_of(t_ns), imu_of(t_ns)
+            states, imu, held = states_of(t_ns), imu_of(t_ns), gimbal_of(t_ns)
             if t_s >= from_s:
                 decoded, image = capture.retrieve()
                 frame = Frame(
@@ -114,7 +117,7 @@ class Video:
                     height=camera.height,
                     error="" if decoded else "cannot be decoded",
                 )
-                yield Shot(frame, states, image if decoded else None, imu)
+                yield Shot(frame, states, image if decoded else None, imu, held)
             frame_id += 1
 
     def _find_description(self) -> Path:
@@ -126,15 +129,17 @@ class Video:
             "[camera] and [start]"
         )
 
-    def _telemetry(self) -> list[VehicleState]:
+    def _stated(self) -> list[VehicleState]:
+        """What a table beside the video states, in time order."""
         table = self.path.with_suffix(".csv")
         states: list[VehicleState] = []
         if table.is_file():
             rows = read_table(table, table.name, with_file=False)
             states += [row.state for row in rows if row.state is not None]
-        if self._log is not None:
-            states += self._log.states
-        return sorted(states, key=lambda state: state.t_ns)
+        for subtitles in (self.path.with_suffix(".SRT"), self.path.with_suffix(".srt")):
+            if subtitles.is_file() and not states:  # a table beside it was made on purpose
+                states += read_srt(subtitles)
+        return states
 
     def _open(self) -> cv2.VideoCapture:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", FFMPEG_QUIET)

@@ -18,6 +18,7 @@ from terrafix.anchor.relocalization.position_prior import (
 )
 from terrafix.anchor.relocalization.relocalizer import Relocalizer
 from terrafix.anchor.verification.lock_monitor import MAX_LOG_ODDS, START_LOG_ODDS
+from terrafix.core.agreement import Cause
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import (
@@ -117,7 +118,7 @@ def test_a_prior_against_an_unconfirmed_start_starts_a_search_there(
     package: Any = SingleMapPackage
     monkeypatch.setattr(package, "bounds_m", (-3000.0, -3000.0, 3000.0, 3000.0))
     frames.put(1, view(ground, PINHOLE, R, TRUE_M))
-    node._localizer._lock_monitor.log_odds = START_LOG_ODDS - 1.0
+    node._localizer._lock_monitor.agreement.begin(Cause.ELSEWHERE, -(START_LOG_ODDS - 1.0))
     list(node.on(hint_at(1500.0, 0.0, 500.0)))
     match, verdict, state = messages_after(node, 1)
     assert isinstance(match, MapMatch) and match.verdict is Verdict.LOST and match.pose is None

@@ -5,7 +5,6 @@ import math
 import pytest
 
 from terrafix.anchor.verification.lock_monitor import (
-    DOUBT_LOG_ODDS,
     LOCK_NULL_GAIN,
     MAX_GAIN,
     MAX_LOG_ODDS,
@@ -15,8 +14,15 @@ from terrafix.anchor.verification.lock_monitor import (
     has_wide_sigma,
     pose_gain,
 )
+from terrafix.core.agreement import Cause
 
 AGL_M, SIGMA_M = 100.0, 5.0
+
+
+def with_odds(log_odds: float) -> LockMonitor:
+    monitor = LockMonitor()
+    monitor.agreement.begin(Cause.ELSEWHERE, -log_odds)
+    return monitor
 
 
 def observed(gain: float, *, weight: float = 1.0, new: float = 1.0, inliers: int = 0) -> float:
@@ -75,16 +81,14 @@ def test_the_log_odds_are_bounded_so_that_a_lock_can_be_lost_again() -> None:
 
 
 def test_nothing_counts_against_a_position_with_a_wide_sigma_that_has_the_odds_of_a_start_at_most() -> None:
-    sure, doubted = LockMonitor(), LockMonitor()
-    sure.log_odds, doubted.log_odds = MAX_LOG_ODDS, 1.0
+    sure, doubted = with_odds(MAX_LOG_ODDS), with_odds(1.0)
     for monitor in (sure, doubted):
         monitor.update(-5.0, 1.0, 1.0, 0, 60.0, AGL_M)
     assert (sure.log_odds, doubted.log_odds) == (START_LOG_ODDS, 1.0)
 
 
 def test_evidence_and_poses_end_a_doubt_from_before_the_sigma_was_wide() -> None:
-    monitor = LockMonitor()
-    monitor.log_odds = 1.0
+    monitor = with_odds(1.0)
     monitor.update(4.5, 1.0, 1.0, 0, 60.0, AGL_M)
     assert monitor.log_odds == pytest.approx(2.5) and monitor.wrong_probability > 0.0
     monitor.update(-5.0, 1.0, 1.0, 8, 60.0, AGL_M)
@@ -97,7 +101,8 @@ def test_evidence_and_poses_end_a_doubt_from_before_the_sigma_was_wide() -> None
     ("log_odds", "wrong", "lost"),
     [
         (20.0, 0.0, False),
-        (DOUBT_LOG_ODDS + 0.01, 0.0, False),
+        (math.log(0.95 / 0.05) + 0.01, 0.0, False),
+        (math.log(0.95 / 0.05) - 0.01, 0.05, False),
         (2.0, 0.119, False),
         (0.0, 0.5, False),
         (-1.0, 0.731, True),
@@ -106,8 +111,6 @@ def test_evidence_and_poses_end_a_doubt_from_before_the_sigma_was_wide() -> None
 def test_the_wrong_probability_follows_the_odds_below_those_of_five_per_cent(
     log_odds: float, wrong: float, lost: bool
 ) -> None:
-    monitor = LockMonitor()
-    monitor.log_odds = log_odds
+    monitor = with_odds(log_odds)
     assert monitor.wrong_probability == pytest.approx(wrong, abs=1e-3)
     assert monitor.lost is lost
-    assert pytest.approx(math.log(0.95 / 0.05), abs=0.01) == DOUBT_LOG_ODDS

@@ -23,7 +23,7 @@ HEIGHT_M, SIGMA, FOCAL_SIGMA = 100.0, 5e-4, 0.01
 NODES = ((C(0), B(0)), (C(1), B(1)), (C(2), B(2)))
 
 
-class Flown:
+class ThreeCameras:
     """Three cameras over hills of ``relief_m`` (1-sigma), their matches, and a guess of their poses."""
 
     def __init__(self, seed: int, relief_m: float = 8.0, lens: float = 0.0, *, points: int = 60) -> None:
@@ -68,7 +68,7 @@ def length(pose: gtsam.Pose3) -> float:
     return float(np.linalg.norm(pose.translation()))
 
 
-def constraint_of(flown: Flown, guess: ThreeViewPose | None = None) -> ThreeViewConstraint:
+def constraint_of(flown: ThreeCameras, guess: ThreeViewPose | None = None) -> ThreeViewConstraint:
     constraint = three_view_constraint(flown.triples, SIGMA, guess or flown.guess(), FOCAL_SIGMA)
     assert constraint is not None
     return constraint
@@ -77,7 +77,7 @@ def constraint_of(flown: Flown, guess: ThreeViewPose | None = None) -> ThreeView
 def test_the_ratio_of_the_translations_does_not_depend_on_relief() -> None:
     off = []
     for seed in range(30):
-        flown = Flown(seed)
+        flown = ThreeCameras(seed)
         at = constraint_of(flown).at
         true = length(flown.poses[1].between(flown.poses[2])) / length(flown.poses[1].between(flown.poses[0]))
         off.append(length(at.last) / length(at.first) / true - 1.0)
@@ -87,7 +87,7 @@ def test_the_ratio_of_the_translations_does_not_depend_on_relief() -> None:
 def test_the_residual_at_the_truth_is_within_the_stated_noise() -> None:
     squares, rows = 0.0, 0
     for seed in range(40):
-        flown = Flown(seed)
+        flown = ThreeCameras(seed)
         constraint = constraint_of(flown)
         error = three_view_factor(NODES, constraint, rises=False).unwhitenedError(flown.values())
         squares, rows = squares + float(error @ error), rows + len(error)
@@ -95,7 +95,7 @@ def test_the_residual_at_the_truth_is_within_the_stated_noise() -> None:
 
 
 def test_the_factor_carries_no_information_about_absolute_scale() -> None:
-    flown = Flown(3)
+    flown = ThreeCameras(3)
     constraint = constraint_of(flown)
     factor = three_view_factor(NODES, constraint, rises=False)
     same, longer = (factor.unwhitenedError(flown.values(scale)) for scale in (1.0, 1.3))
@@ -104,14 +104,14 @@ def test_the_factor_carries_no_information_about_absolute_scale() -> None:
 
 
 def test_the_radial_coefficient_is_observable() -> None:
-    flown = Flown(4, lens=-0.03)
+    flown = ThreeCameras(4, lens=-0.03)
     factor = three_view_factor(NODES, constraint_of(flown, flown.guess(0.2)), rises=False)
     square = {lens: float(np.sum(factor.unwhitenedError(flown.values(lens=lens)) ** 2)) for lens in (0.0, -0.03, -0.06)}
     assert square[-0.03] < 0.5 * min(square[0.0], square[-0.06])
 
 
 def test_short_translations_and_few_points_give_no_constraint() -> None:
-    flown = Flown(5)
+    flown = ThreeCameras(5)
     guess = flown.guess()
     assert three_view_constraint(flown.triples[: MIN_TRIPLES - 1], SIGMA, guess, FOCAL_SIGMA) is None
     short = replace(guess, last=gtsam.Pose3(guess.last.rotation(), 0.05 * guess.last.translation()))
@@ -119,14 +119,14 @@ def test_short_translations_and_few_points_give_no_constraint() -> None:
 
 
 def test_mismatched_points_give_no_constraint() -> None:
-    flown = Flown(6)
+    flown = ThreeCameras(6)
     mixed = flown.triples.copy()
     mixed[:, 4:] = mixed[::-1, 4:]
     assert three_view_constraint(mixed, SIGMA, flown.guess(), FOCAL_SIGMA) is None
 
 
 def test_a_solution_far_from_the_guess_is_rejected() -> None:
-    flown = Flown(7)
+    flown = ThreeCameras(7)
     guess = flown.guess(0.0)
     far = replace(guess, last=guess.last.compose(gtsam.Pose3(gtsam.Rot3.Rz(0.2), np.zeros(3))))
     assert three_view_constraint(flown.triples, SIGMA, guess, FOCAL_SIGMA) is not None
@@ -135,7 +135,7 @@ def test_a_solution_far_from_the_guess_is_rejected() -> None:
 
 @pytest.mark.parametrize("rises", [False, True])
 def test_the_jacobians_match_numerical_differences(rises: bool) -> None:
-    flown = Flown(8)
+    flown = ThreeCameras(8)
     factor = three_view_factor(NODES, constraint_of(flown, flown.guess(0.0)), rises=rises)
     values = flown.values()
     if rises:
@@ -165,7 +165,7 @@ def test_the_jacobians_match_numerical_differences(rises: bool) -> None:
 def test_a_focal_length_that_is_a_variable_explains_its_error() -> None:
     """Images through a focal length that is 2 % longer than described fit the true poses at that value, and not at the
     described one."""
-    flown, longer = Flown(3), 0.02
+    flown, longer = ThreeCameras(3), 0.02
     triples = flown.triples * np.exp(longer)
     guess = flown.guess(0.1)
     constraint = three_view_constraint_of_focal(triples, SIGMA, guess, 0.1)

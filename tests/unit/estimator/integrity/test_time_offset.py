@@ -21,6 +21,7 @@ from terrafix.messages import (
     Odometry,
     Prediction,
     VehicleState,
+    Verdict,
 )
 
 R_B_C = Mount.of(CAMERA).r_b_c()
@@ -74,6 +75,37 @@ def test_without_attitudes_nothing_is_compared_and_views_do_not_pile_up() -> Non
             msgspec.convert({"t_ns": i * 10**9, "frame_id": i, **view, "type": "Odometry"}, Odometry), telemetry, 100.0
         )
     assert offset.applied_s == 0.0 and len(offset._pending) < 6
+
+
+def straight(seen: float) -> TimeOffset:
+    """A vehicle flies level with 20 m/s at 100 m for 25 s. From 15 s on images show the share ``seen`` of it."""
+    telemetry, offset = Telemetry(), TimeOffset(R_B_C)
+    rng = np.random.default_rng(5)
+    offset.buffered, offset._noise = True, [np.radians(0.2) ** 2, 0.005**2]  # as learnt in some minutes
+    for i in range(50):
+        for part_ns in range(0, 500_000_000, 100_000_000):
+            at_ns = i * 500_000_000 + part_ns
+            samples = [(0, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0)]
+            telemetry.add(
+                VehicleState(t_ns=at_ns, source="test", yaw_rad=0.0, pitch_rad=0.0, roll_rad=0.0, agl_m=100.0)
+            )
+            telemetry.add_imu(Imu(t_ns=at_ns, source="test", samples=samples))
+        way = 0.1 * (seen if i >= 30 else 1.0)
+        pairs = [(x, y, x - way + rng.normal(0.0, 1e-3), y) for x in (-0.2, 0.0, 0.2, 0.3) for y in (-0.2, 0.2)]
+        view = Odometry(
+            t_ns=i * 500_000_000, frame_id=i, keyframe_id=max(i - 1, 0), verdict=Verdict.ACCEPTED, two_view=pairs
+        )
+        offset.add(view, telemetry, 100.0)
+    return offset
+
+
+@pytest.mark.parametrize(("seen", "far"), [(1.0, False), (0.85, True), (1.4, False)])
+def test_in_straight_flight_a_drift_shows_as_a_velocity_that_changes_without_acceleration(
+    seen: float, far: bool
+) -> None:
+    offset = straight(seen)
+    assert (offset.sigma_s > 0.3) == far
+    assert offset.estimate[0] > 0.1 if far else offset.sigma_s <= PRIOR_SIGMA_S
 
 
 def test_an_offset_that_nothing_observes_is_claimed_once_its_buffer_may_have_filled() -> None:

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
-from terrafix.estimator.measurements.attitude_height import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
-from terrafix.estimator.measurements.telemetry_buffer import MAX_ATTITUDE_GAP_NS, MAX_GAP_NS, Attitude, Telemetry
+from terrafix.estimator.measurements.telemetry_buffer import (
+    MAX_ATTITUDE_GAP_NS,
+    MAX_GAP_NS,
+    TURN_UNSEEN_RAD,
+    UNKNOWN_ATTITUDE_RAD,
+    Attitude,
+    Telemetry,
+)
 from terrafix.messages import VehicleState
 
 SIGMAS_RAD = math.radians(0.7), math.radians(3.0)

@@ -5,7 +5,7 @@ import pytest
 
 from terrafix.core.geodesy import yaw_of
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.estimator.measurements.attitude_height import UNKNOWN_ATTITUDE_RAD
+from terrafix.estimator.measurements.telemetry_buffer import UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.models.plane_motion import Ground, RelativePose, relative_pose
 from terrafix.vision.feature_tracker import FrameTracker
 from terrafix_lab.sim.true_messages import apply, homography

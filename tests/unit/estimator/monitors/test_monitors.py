@@ -11,6 +11,7 @@ import pytest
 
 from map_matches import with_pose
 from simulated_flight import ORIGIN, EstimatorRun, Flight, sigma_m, t_ns
+from terrafix.core.agreement import Agreement, Cause
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
@@ -19,7 +20,7 @@ from terrafix.estimator.monitors.cusum import MARGIN, MAX_STEP, Cusum, threshold
 from terrafix.estimator.monitors.image_shape import ASPECT_RATIOS, ShapeMonitor
 from terrafix.estimator.monitors.inertial import MIN_CHANGE_MPS, MIN_WINDOW_S, MOUNT_YAWS_DEG, InertialMonitor
 from terrafix.estimator.monitors.map_offsets import OffsetMonitor, log_height_ratio
-from terrafix.estimator.monitors.registration import ERROR_PER_PATH, MIN_SPACING_HEIGHTS, PRIOR_WRONG, Registration
+from terrafix.estimator.monitors.registration import ERROR_PER_PATH, MIN_SPACING_HEIGHTS, Registration
 from terrafix.estimator.monitors.turns import TurnMonitor
 from terrafix.estimator.monitors.visual_motion import visual_motion
 from terrafix.messages import ON_DRAWN, CalibrationFault, MapMatch, Message, Odometry, VehicleState, Verdict
@@ -212,48 +213,58 @@ def _attempts(monitor: Registration, count: int, *, found: bool) -> None:
         monitor.add_attempt(found=found)
 
 
-def test_correlations_without_a_match_inflate_the_covariance_before_the_alarm() -> None:
-    monitor = Registration()
-    monitor.add_path(40.0, HEIGHT_M)
-    assert monitor.sigma_m == pytest.approx(0.0, abs=1e-3)  # no correlation yet
+@pytest.fixture
+def agreement() -> Agreement:
+    return Agreement()
+
+
+@pytest.fixture
+def monitor(agreement: Agreement) -> Registration:
+    return Registration(agreement)
+
+
+def test_correlations_without_a_match_raise_the_probability_before_the_alarm(
+    monitor: Registration, agreement: Agreement
+) -> None:
+    assert agreement.weight(Cause.DESCRIPTION) == 0.0  # no correlation yet
     _attempts(monitor, 1, found=False)
-    assert monitor.sigma_m == pytest.approx(ERROR_PER_PATH * 65.0 * math.sqrt(0.2067 - PRIOR_WRONG), rel=0.02)
+    assert agreement.weight(Cause.DESCRIPTION) == pytest.approx(0.2067, abs=1e-3)
     _attempts(monitor, 3, found=False)
-    assert not monitor.active and monitor.probability > 0.9
-    _attempts(monitor, 10, found=False)
-    assert monitor.active and not monitor.confirmed
-
-
-def test_correlations_over_the_same_ground_count_once() -> None:
-    monitor = Registration()
+    assert not monitor.active and agreement.weight(Cause.DESCRIPTION) > 0.9
+    _attempts(monitor, 7, found=False)
+    assert not monitor.active
     _attempts(monitor, 1, found=False)
-    once = monitor.probability
+    assert monitor.active
+
+
+def test_correlations_over_the_same_ground_count_once(monitor: Registration, agreement: Agreement) -> None:
+    _attempts(monitor, 1, found=False)
+    once = agreement.probability(Cause.DESCRIPTION)
     for _ in range(50):
         monitor.add_attempt(found=False)
-    assert monitor.probability == once
+    assert agreement.probability(Cause.DESCRIPTION) == once
 
 
-def test_a_confirmed_description_stays_confirmed() -> None:
-    monitor = Registration()
+def test_a_confirmed_description_stays_confirmed(monitor: Registration, agreement: Agreement) -> None:
     _attempts(monitor, 1, found=True)
-    assert not monitor.confirmed
+    assert agreement.probability(Cause.DESCRIPTION) > 0.0
     _attempts(monitor, 1, found=True)
-    assert monitor.confirmed and monitor.sigma_m == 0.0
+    assert agreement.probability(Cause.DESCRIPTION) == 0.0
     _attempts(monitor, 50, found=False)
-    assert monitor.probability == 0.0 and not monitor.active
+    assert agreement.probability(Cause.DESCRIPTION) == 0.0 and not monitor.active
 
 
-def test_several_matches_end_the_registration_alarm() -> None:
-    monitor = Registration()
+def test_several_matches_end_the_registration_alarm(monitor: Registration, agreement: Agreement) -> None:
     _attempts(monitor, 30, found=False)
     _attempts(monitor, 1, found=True)
     assert monitor.active
     _attempts(monitor, 8, found=True)
-    assert not monitor.active and monitor.confirmed and monitor.sigma_m == 0.0
+    assert not monitor.active and agreement.probability(Cause.DESCRIPTION) == 0.0
 
 
-def test_the_path_since_the_last_match_bounds_the_error_of_a_wrong_description() -> None:
-    monitor = Registration()
+def test_the_path_since_the_last_match_bounds_the_error_of_a_wrong_description(
+    monitor: Registration, agreement: Agreement
+) -> None:
     _attempts(monitor, 1, found=True)
     assert monitor.path_error_m == 0.0
     _attempts(monitor, 1, found=False)
@@ -262,7 +273,7 @@ def test_the_path_since_the_last_match_bounds_the_error_of_a_wrong_description()
     assert once_m == ERROR_PER_PATH * MIN_SPACING_HEIGHTS * HEIGHT_M
     assert monitor.path_error_m == pytest.approx(4.0 * once_m)
     _attempts(monitor, 6, found=True)
-    assert monitor.confirmed
+    assert agreement.probability(Cause.DESCRIPTION) == 0.0
     _attempts(monitor, 2, found=False)
     assert monitor.path_error_m == pytest.approx(2.0 * once_m)
     _attempts(monitor, 1, found=True)  # also of a confirmed description
@@ -341,13 +352,16 @@ def test_rejected_coarse_matches_count_against_registration() -> None:
     assert [(fault.quantity, fault.active) for fault in faults] == [("registration", True)]
 
 
-def test_correlations_over_ground_without_texture_are_ignored() -> None:
-    def nothing(message: Message) -> Message:
-        if isinstance(message, Odometry):
-            return msgspec.structs.replace(message, verdict=Verdict.NO_FEATURES, two_view=[])
-        return _unmatched(message)
-
-    assert _fly(nothing, fix_every=1)[1] == []
+@pytest.mark.parametrize(("verdict", "counts"), [(Verdict.ACCEPTED, True), (Verdict.NO_FEATURES, False)])
+def test_correlations_count_over_ground_with_texture_alone(verdict: Verdict, counts: bool) -> None:
+    monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(30, fix_every=1, dem=True)
+    for i in range(30):
+        state, odometry, match = flight.messages(i)
+        assert isinstance(odometry, Odometry) and isinstance(match, MapMatch)
+        telemetry.add(state)
+        monitors.on_odometry(msgspec.structs.replace(odometry, verdict=verdict), telemetry, 1.0 * HEIGHT_M, HEIGHT_M)
+        monitors.on_map_match(_unmatched(match), telemetry, accepted=False)
+    assert [fault.quantity for fault in monitors.take_changes(t_ns(30))] == (["registration"] if counts else [])
 
 
 @pytest.mark.slow

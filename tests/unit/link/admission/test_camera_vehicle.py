@@ -28,7 +28,7 @@ CAMERA_ON_9 = m.CameraVehicle(t_ns=0, sysid=9)
 CAMERA_ON_7 = m.CameraVehicle(t_ns=0, sysid=7)
 
 
-class Router(WiredEdge):
+class VehicleWire(WiredEdge):
     """A wire with several vehicles behind it."""
 
     def sends(self, now_ns: int) -> int:
@@ -46,15 +46,17 @@ class Router(WiredEdge):
 
 
 @pytest.fixture
-def router() -> Router:
-    return Router()
+def router() -> VehicleWire:
+    return VehicleWire()
 
 
 def served(published: list[m.Message]) -> list[tuple[int, bool, list[int]]]:
     return [(x.sysid, x.confirmed, x.candidates) for x in published if isinstance(x, m.ServedVehicle)]
 
 
-def test_no_position_leaves_and_no_telemetry_is_used_while_two_vehicles_may_carry_the_camera(router: Router) -> None:
+def test_no_position_leaves_and_no_telemetry_is_used_while_two_vehicles_may_carry_the_camera(
+    router: VehicleWire,
+) -> None:
     for second in range(1, 20):
         published = router.both(second * S)
         assert states(published) == [] or second == 1
@@ -62,7 +64,7 @@ def test_no_position_leaves_and_no_telemetry_is_used_while_two_vehicles_may_carr
     assert served(published)[-1] == (7, False, [7, 9])
 
 
-def test_the_vehicle_that_turns_as_the_camera_does_is_served(router: Router) -> None:
+def test_the_vehicle_that_turns_as_the_camera_does_is_served(router: VehicleWire) -> None:
     router.both(1 * S)
     router.edge.on_message(CAMERA_ON_9)
     published = router.both(2 * S)
@@ -71,7 +73,7 @@ def test_the_vehicle_that_turns_as_the_camera_does_is_served(router: Router) -> 
     assert router.sends(2 * S + 2 * MS) == 1
 
 
-def test_the_pilot_is_told_that_it_is_unclear_and_how_to_state_it(router: Router) -> None:
+def test_the_pilot_is_told_that_it_is_unclear_and_how_to_state_it(router: VehicleWire) -> None:
     for second in range(1, 35):
         router.both(second * S)
     assert router.texts() == ["Terrafix: no fix: camera on vehicle 7, 9?"] * 2  # every 30 s
@@ -90,7 +92,7 @@ def test_texts_about_the_camera_fit_into_statustext(sysids: list[int]) -> None:
     assert all(len(f"Terrafix: {text}") <= 50 for text in (unclear_text(sysids), *camera_texts(255)))
 
 
-def test_the_turns_of_all_candidates_are_published_and_requested(router: Router) -> None:
+def test_the_turns_of_all_candidates_are_published_and_requested(router: VehicleWire) -> None:
     router.both(1 * S)
     published = router.both(2 * S)
     attitudes = [(x.sysid, round(x.yaw_rad, 3)) for x in published if isinstance(x, m.CandidateAttitude)]
@@ -101,7 +103,7 @@ def test_the_turns_of_all_candidates_are_published_and_requested(router: Router)
 
 
 def test_a_configured_system_id_is_served_beside_others() -> None:
-    router = Router(autopilot_sysid=9)
+    router = VehicleWire(autopilot_sysid=9)
     router.both(1 * S)
     router.edge.on_message(CAMERA_ON_7)
     published = router.both(2 * S)
@@ -112,7 +114,7 @@ def test_a_configured_system_id_is_served_beside_others() -> None:
 # --- later in the flight ---
 
 
-def test_a_vehicle_that_was_confirmed_alone_stays_served_whatever_comes_later(router: Router) -> None:
+def test_a_vehicle_that_was_confirmed_alone_stays_served_whatever_comes_later(router: VehicleWire) -> None:
     for second in range(1, 100):
         router.receives(second * S, armed(), attitude(1000 * second))
     router.edge.on_message(CAMERA_ON_7)
@@ -122,7 +124,7 @@ def test_a_vehicle_that_was_confirmed_alone_stays_served_whatever_comes_later(ro
     assert router.texts() == ["Terrafix: vehicle 9 on our link gets GPS_INPUT"]
 
 
-def test_heartbeats_of_many_forged_system_ids_do_not_silence_a_confirmed_vehicle(router: Router) -> None:
+def test_heartbeats_of_many_forged_system_ids_do_not_silence_a_confirmed_vehicle(router: VehicleWire) -> None:
     router.receives(1 * S, armed(), attitude(1000))
     router.edge.on_message(CAMERA_ON_7)
     for sysid in range(100, 200):
@@ -130,7 +132,7 @@ def test_heartbeats_of_many_forged_system_ids_do_not_silence_a_confirmed_vehicle
         assert router.sends(2 * S + sysid * MS) == 1
 
 
-def test_a_vehicle_that_was_not_confirmed_is_not_served_beside_a_second_one(router: Router) -> None:
+def test_a_vehicle_that_was_not_confirmed_is_not_served_beside_a_second_one(router: VehicleWire) -> None:
     router.receives(1 * S, armed(), attitude(1000))
     assert router.sends(1 * S) == 1
     router.both(100 * S)
@@ -146,7 +148,7 @@ def test_a_vehicle_that_was_not_confirmed_is_not_served_beside_a_second_one(rout
     ],
 )
 def test_a_vehicle_that_disappears_may_still_carry_the_camera_for_a_time(
-    router: Router, last: list[Any], silent_ns: int, sent: list[int]
+    router: VehicleWire, last: list[Any], silent_ns: int, sent: list[int]
 ) -> None:
     router.receives(1 * S, armed(), attitude(1000))
     router.receives(1 * S, *last, sysid=9)
@@ -157,7 +159,7 @@ def test_a_vehicle_that_disappears_may_still_carry_the_camera_for_a_time(
     assert found == sent
 
 
-def test_a_vehicle_that_follows_a_confirmed_one_must_be_confirmed_itself(router: Router) -> None:
+def test_a_vehicle_that_follows_a_confirmed_one_must_be_confirmed_itself(router: VehicleWire) -> None:
     router.receives(1 * S, heartbeat(), attitude(1000))
     router.edge.on_message(CAMERA_ON_7)
     later_ns = 2 * S + VEHICLE_CHANGE_TIMEOUT_NS
@@ -167,14 +169,14 @@ def test_a_vehicle_that_follows_a_confirmed_one_must_be_confirmed_itself(router:
     assert router.sends(later_ns + MS) == 1
 
 
-def test_more_vehicles_than_are_compared_leave_it_unclear(router: Router) -> None:
+def test_more_vehicles_than_are_compared_leave_it_unclear(router: VehicleWire) -> None:
     for sysid in range(1, MAX_RIVALS + 5):
         router.receives(sysid * MS, armed(), sysid=sysid)
     assert len(served(router.published)[-1][2]) == MAX_RIVALS + 1
     assert router.sends(S) == 0
 
 
-def test_while_the_confirmed_vehicle_is_not_there_no_other_is_served(router: Router) -> None:
+def test_while_the_confirmed_vehicle_is_not_there_no_other_is_served(router: VehicleWire) -> None:
     router.receives(1 * S, armed(), attitude(1000))
     router.edge.on_message(CAMERA_ON_9)
     assert router.sends(1 * S) == 0
@@ -188,13 +190,13 @@ def test_while_the_confirmed_vehicle_is_not_there_no_other_is_served(router: Rou
 
 def test_a_link_that_restarts_while_it_is_unclear_sends_nothing_before_it_has_heard_the_others(tmp_path: Path) -> None:
     file = tmp_path / "link.checkpoint"
-    before = Router(checkpoint=file)
+    before = VehicleWire(checkpoint=file)
     before.both(1 * S)
     before.both(2 * S)
     before.sends(2 * S + 2 * MS)
     found = load_checkpoint(file)
     assert found is not None and found.last is None
-    after = Router(checkpoint=file)
+    after = VehicleWire(checkpoint=file)
     assert after.sends(10 * S) == 0
     after.receives(10 * S, armed(), attitude(1000))
     assert after.sends(10 * S) == 0
@@ -204,8 +206,8 @@ def test_a_link_that_restarts_while_it_is_unclear_sends_nothing_before_it_has_he
 
 def test_a_restarted_link_that_hears_no_other_vehicle_sends_after_a_heartbeat(tmp_path: Path) -> None:
     file = tmp_path / "link.checkpoint"
-    Router(checkpoint=file).receives(1 * S, armed())
-    after = Router(checkpoint=file)
+    VehicleWire(checkpoint=file).receives(1 * S, armed())
+    after = VehicleWire(checkpoint=file)
     after.receives(10 * S, armed())
     assert [after.sends(10 * S + LISTEN_NS - MS), after.sends(10 * S + LISTEN_NS)] == [0, 1]
 

@@ -32,7 +32,7 @@ DECIDES_WITHIN_S = 60.0  # generous: after 12 s on an idle computer
 SERVED_S = 3.0
 
 
-class Router:
+class DatagramRouter:
     """Forwards each datagram of one port to all other senders there, as MAVProxy does."""
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ def standing(_t_s: float) -> PeerState:
     return PeerState(ORIGIN.lat_deg, ORIGIN.lon_deg, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class Camera:
+class FlyingCamera:
     """Odometry and estimates of the flying vehicle. ``clock_s``: seconds of the flight are ``zero_ns`` on the clock."""
 
     def __init__(self, zero_ns: int) -> None:
@@ -107,10 +107,10 @@ class Camera:
 
 @pytest.mark.slow
 def test_of_two_vehicles_behind_one_router_the_one_with_the_camera_is_served() -> None:
-    router, zero_s = Router(), time.monotonic()
+    router, zero_s = DatagramRouter(), time.monotonic()
     peers = {sysid: AutopilotPeer(seed=sysid, sysid=sysid) for sysid in (1, 2)}
     edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{router.port}"))
-    node, estimator, camera = LinkNode(10.0), EstimatorNode(), Camera(round(zero_s * 1e9))
+    node, estimator, camera = LinkNode(10.0), EstimatorNode(), FlyingCamera(round(zero_s * 1e9))
     published: list[m.Message] = [*estimator.on(msgspec.structs.replace(ORIGIN, agl_sigma_m=5.0))]
 
     def exchange(messages: list[m.Message]) -> None:

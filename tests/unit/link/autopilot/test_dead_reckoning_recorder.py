@@ -24,6 +24,8 @@ SPEED_MPS, RATE_RADPS = 22.0, 0.4  # a bank of 42 degrees
 KILLED_S, RESTARTED_S = 2.0, 8.0
 EKF_ERROR_M, EKF_ERROR_MPS = (30.0, -10.0), (0.5, -0.25)  # constant errors of the EKF: position, velocity
 
+CLIMB_MPS2 = 0.05  # the climb rate grows
+
 
 def truth(t_s: float) -> tuple[float, float, float, float]:
     """-> east, north [m] and their velocities [m/s] of a circling plane."""
@@ -39,7 +41,7 @@ def ekf_position(t_s: float, boot_s: float = 100.0) -> Any:
         north_m + EKF_ERROR_M[1] + EKF_ERROR_MPS[1] * t_s,
     )
     lat_deg, lon_deg = PLACE.to_wgs84(east_m, north_m)
-    cm = round(100 * (vn + EKF_ERROR_MPS[1])), round(100 * (ve + EKF_ERROR_MPS[0])), -150
+    cm = round(100 * (vn + EKF_ERROR_MPS[1])), round(100 * (ve + EKF_ERROR_MPS[0])), -round(100 * CLIMB_MPS2 * t_s)
     place = round(lat_deg * 1e7), round(lon_deg * 1e7), 500_000, 120_000
     return mavlink.MAVLink_global_position_int_message(round(1e3 * (boot_s + t_s)), *place, *cm, 0)
 
@@ -60,7 +62,7 @@ def fix(t_s: float, fix_type: int = 3) -> GpsInput:
     return msgspec.structs.replace(GPS, t_ns=round(t_s * S), fix_type=fix_type, **where, **velocity)
 
 
-class Autopilot:
+class RecordingAutopilot:
     """An autopilot connected to successive link processes that share a checkpoint file."""
 
     def __init__(self, checkpoint_file: Path) -> None:
@@ -93,19 +95,19 @@ def dead_reckonings(messages: Iterable[Message]) -> list[EkfDeadReckoning]:
 
 
 @pytest.fixture
-def autopilot(tmp_path: Path) -> Autopilot:
-    return Autopilot(tmp_path / "link.checkpoint")
+def autopilot(tmp_path: Path) -> RecordingAutopilot:
+    return RecordingAutopilot(tmp_path / "link.checkpoint")
 
 
 @pytest.fixture
-def restarted(autopilot: Autopilot) -> Autopilot:
+def restarted(autopilot: RecordingAutopilot) -> RecordingAutopilot:
     """The link was killed in flight and has started again."""
     autopilot.fly_until_killed()
     autopilot.restart()
     return autopilot
 
 
-def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(restarted: Autopilot) -> None:
+def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(restarted: RecordingAutopilot) -> None:
     assert not dead_reckonings(
         restarted.sends(RESTARTED_S - 0.2, ekf_position(RESTARTED_S - 0.2))
     )  # EKF status and receivers are not known yet
@@ -120,10 +122,13 @@ def test_a_restarted_link_publishes_the_dead_reckoning_of_the_ekf(restarted: Aut
     # Displacement and change of velocity do not contain the error that the EKF had at that time.
     way_m = [now[i] - before[i] - message.duration_s * before[2 + i] for i in range(2)]
     assert message.delta_p_m == pytest.approx(way_m, abs=0.3) and math.hypot(*way_m) > 50.0
-    assert message.delta_v_mps == pytest.approx((now[2] - before[2], now[3] - before[3], 0.0), abs=0.02)
+    assert message.delta_v_mps == pytest.approx(
+        (now[2] - before[2], now[3] - before[3], CLIMB_MPS2 * message.duration_s), abs=0.02
+    )
+    assert message.delta_v_mps[2] > 0.2
 
 
-def test_a_restarted_link_requests_the_slow_messages(restarted: Autopilot) -> None:
+def test_a_restarted_link_requests_the_slow_messages(restarted: RecordingAutopilot) -> None:
     restarted.sends(RESTARTED_S, ekf_position(RESTARTED_S))
     assert set(restarted.requested()) == {193, 24, 124}  # EKF_STATUS_REPORT, GPS_RAW_INT, GPS2_RAW
     restarted.sends(RESTARTED_S + 0.5, status(), receiver(1))
@@ -132,7 +137,7 @@ def test_a_restarted_link_requests_the_slow_messages(restarted: Autopilot) -> No
 
 @pytest.mark.parametrize(("before", "after"), [(3, 1), (1, 3)])
 def test_no_dead_reckoning_is_published_while_another_receiver_has_a_fix(
-    autopilot: Autopilot, before: int, after: int
+    autopilot: RecordingAutopilot, before: int, after: int
 ) -> None:
     autopilot.fly_until_killed(receiver_fix=before)
     autopilot.restart()
@@ -142,24 +147,24 @@ def test_no_dead_reckoning_is_published_while_another_receiver_has_a_fix(
     )
 
 
-def test_no_dead_reckoning_is_published_before_the_known_receiver_is_received(restarted: Autopilot) -> None:
+def test_no_dead_reckoning_is_published_before_the_known_receiver_is_received(restarted: RecordingAutopilot) -> None:
     assert not dead_reckonings(restarted.sends(RESTARTED_S, status(), ekf_position(RESTARTED_S)))
     assert dead_reckonings(restarted.sends(RESTARTED_S + 0.2, receiver(1), ekf_position(RESTARTED_S + 0.2)))
 
 
 @pytest.mark.parametrize("flags", [mavlink.EKF_ATTITUDE, HEALTHY_FLAGS | mavlink.EKF_CONST_POS_MODE])
-def test_no_dead_reckoning_is_published_without_a_valid_ekf_velocity(restarted: Autopilot, flags: int) -> None:
+def test_no_dead_reckoning_is_published_without_a_valid_ekf_velocity(restarted: RecordingAutopilot, flags: int) -> None:
     assert not dead_reckonings(restarted.sends(RESTARTED_S, status(flags), receiver(1), ekf_position(RESTARTED_S)))
 
 
-def test_no_dead_reckoning_is_published_after_a_reboot_or_more_than_a_minute(restarted: Autopilot) -> None:
+def test_no_dead_reckoning_is_published_after_a_reboot_or_more_than_a_minute(restarted: RecordingAutopilot) -> None:
     assert not dead_reckonings(
         restarted.sends(RESTARTED_S, status(), receiver(1), ekf_position(RESTARTED_S, boot_s=1.0))
     )
     assert not dead_reckonings(restarted.sends(80.0, status(), receiver(1), ekf_position(80.0)))
 
 
-def test_no_dead_reckoning_is_published_while_we_send_a_fix(autopilot: Autopilot) -> None:
+def test_no_dead_reckoning_is_published_while_we_send_a_fix(autopilot: RecordingAutopilot) -> None:
     autopilot.fly_until_killed()
     assert not dead_reckonings(autopilot.sends(KILLED_S + 0.1, ekf_position(KILLED_S + 0.1)))
     autopilot.link.edge.on_message(fix(KILLED_S + 0.2, fix_type=1))

@@ -28,7 +28,7 @@ def test_pressure_altitudes_are_those_of_the_standard_atmosphere(hpa: float, hei
     assert isa_height_m(hpa) == pytest.approx(height_m, abs=0.6)
 
 
-class Vehicle:
+class TwoHeightsAutopilot:
     """An autopilot on a connection in memory, with separate heights of its EKF and its barometer."""
 
     def __init__(self, checkpoint_file: Path | None = None) -> None:
@@ -93,7 +93,7 @@ def test_the_height_is_that_above_take_off_by_pressure(
     on_ground: list[tuple[float, float, float]], flight: list[tuple[float | None, float | None, float, float]]
 ) -> None:
     """Steps: height of the EKF, height by pressure [m], duration [s], and in flight the published height."""
-    vehicle = Vehicle()
+    vehicle = TwoHeightsAutopilot()
     for ekf_m, above_m, seconds in on_ground:
         vehicle.receive(ekf_m, above_m, flies=False, seconds=seconds)
     for ekf, above, seconds, height_m in flight:
@@ -111,7 +111,7 @@ def test_one_bad_reading_on_the_ground_changes_the_zero_by_a_tenth() -> None:
 
 
 def test_a_rebooted_autopilot_gets_a_new_zero() -> None:
-    vehicle = Vehicle()
+    vehicle = TwoHeightsAutopilot()
     vehicle.receive(0.0, 0.0, flies=False)
     assert vehicle.receive(50.0, 50.0) == pytest.approx(50.0, abs=0.1)
     vehicle.booted_s = vehicle.seconds
@@ -119,7 +119,7 @@ def test_a_rebooted_autopilot_gets_a_new_zero() -> None:
 
 
 def test_a_restarted_link_restores_the_zero_from_the_checkpoint(tmp_path: Path) -> None:
-    vehicle = Vehicle(tmp_path / "link.checkpoint")
+    vehicle = TwoHeightsAutopilot(tmp_path / "link.checkpoint")
     vehicle.receive(0.0, 0.0, flies=False)
     vehicle.receive(55.0, 50.0)
     vehicle.link.edge.on_message(NO_FIX)

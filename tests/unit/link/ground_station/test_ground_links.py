@@ -26,7 +26,7 @@ HINT = mavlink.MAVLink_command_int_message(
 )
 
 
-class Station(Speaker):
+class UdpStation(Speaker):
     """A ground station on a UDP port."""
 
     def __init__(self) -> None:
@@ -37,20 +37,20 @@ class Station(Speaker):
 @pytest.fixture(autouse=True)
 def closed() -> Iterator[None]:
     yield
-    while Rig.open:
-        Rig.open.pop().edge.close()
+    while GroundLinksRig.open:
+        GroundLinksRig.open.pop().edge.close()
 
 
 @pytest.fixture
-def station() -> Iterator[Station]:
-    with Station() as station:
+def station() -> Iterator[UdpStation]:
+    with UdpStation() as station:
         yield station
 
 
-class Rig(WiredEdge):
+class GroundLinksRig(WiredEdge):
     """The edge with the autopilot on a wire in memory, and ground stations on real ports."""
 
-    open: ClassVar[list["Rig"]] = []
+    open: ClassVar[list["GroundLinksRig"]] = []
 
     def __init__(self, *devices: str, **changes: Any) -> None:
         self.open.append(self)
@@ -70,8 +70,8 @@ class Rig(WiredEdge):
         return published
 
 
-def test_a_ground_link_gets_texts_values_and_heartbeats_and_the_autopilot_all_messages(station: Station) -> None:
-    rig = Rig(station.device)
+def test_a_ground_link_gets_texts_values_and_heartbeats_and_the_autopilot_all_messages(station: UdpStation) -> None:
+    rig = GroundLinksRig(station.device)
     rig.run(3.0, heartbeat())
     rig.edge.on_message(m.StatusText(t_ns=0, severity=4, text="Terrafix: a text"))
     assert kinds(station.received()) == {"HEARTBEAT", "NAMED_VALUE_FLOAT", "STATUSTEXT"}
@@ -79,8 +79,8 @@ def test_a_ground_link_gets_texts_values_and_heartbeats_and_the_autopilot_all_me
     assert {"GPS_INPUT", "TIMESYNC", "COMMAND_LONG", "HEARTBEAT", "NAMED_VALUE_FLOAT", "STATUSTEXT"} <= to_autopilot
 
 
-def test_an_autopilot_on_a_ground_link_is_neither_served_nor_forwarded(station: Station) -> None:
-    rig = Rig(station.device)
+def test_an_autopilot_on_a_ground_link_is_neither_served_nor_forwarded(station: UdpStation) -> None:
+    rig = GroundLinksRig(station.device)
     rig.run(1.2)
     station.received()
     station.mav.srcSystem, station.mav.srcComponent = 1, 1  # a router that forwards packets of the autopilot
@@ -93,8 +93,8 @@ def test_an_autopilot_on_a_ground_link_is_neither_served_nor_forwarded(station: 
     assert kinds(rig.wire.take()) & {"ATTITUDE"} == set()
 
 
-def test_a_hint_on_two_links_counts_once_and_is_acknowledged_on_both(station: Station) -> None:
-    rig = Rig(station.device)
+def test_a_hint_on_two_links_counts_once_and_is_acknowledged_on_both(station: UdpStation) -> None:
+    rig = GroundLinksRig(station.device)
     rig.run(1.2)
     station.received()
     station.send(GCS, HINT)
@@ -105,13 +105,13 @@ def test_a_hint_on_two_links_counts_once_and_is_acknowledged_on_both(station: St
     assert [[ack.result for ack in link] for link in acks] == [[mavlink.MAV_RESULT_ACCEPTED]] * 2
 
 
-def test_a_lost_ground_link_does_not_affect_the_others_and_is_opened_again(station: Station) -> None:
+def test_a_lost_ground_link_does_not_affect_the_others_and_is_opened_again(station: UdpStation) -> None:
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     listener.bind(("127.0.0.1", 0))
     listener.listen()
     port = listener.getsockname()[1]
-    rig = Rig(f"tcp:127.0.0.1:{port}", station.device)
+    rig = GroundLinksRig(f"tcp:127.0.0.1:{port}", station.device)
     peer, _ = listener.accept()
     rig.run(1.0, heartbeat())
     assert rig.status().detail.count("ground link") == 0
@@ -132,9 +132,9 @@ def test_a_lost_ground_link_does_not_affect_the_others_and_is_opened_again(stati
         again.close()
 
 
-def test_a_ground_port_in_use_does_not_delay_the_link_to_the_autopilot(station: Station) -> None:
+def test_a_ground_port_in_use_does_not_delay_the_link_to_the_autopilot(station: UdpStation) -> None:
     port = station.socket.getsockname()[1]
-    rig = Rig(f"udpin:127.0.0.1:{port}")
+    rig = GroundLinksRig(f"udpin:127.0.0.1:{port}")
     rig.run(1.0, heartbeat())
     assert "cannot be opened" in rig.status().detail
     assert len(rig.wire.take("GPS_INPUT")) == 10
@@ -147,8 +147,8 @@ def from_ghost(received: list[Any]) -> list[Any]:
     return [x for x in received if x.get_srcSystem() == GHOST_SYSID]
 
 
-def test_the_ghost_vehicle_is_sent_to_the_ground_and_not_to_the_autopilot(station: Station) -> None:
-    rig = Rig(station.device, view_sysid=GHOST_SYSID)
+def test_the_ghost_vehicle_is_sent_to_the_ground_and_not_to_the_autopilot(station: UdpStation) -> None:
+    rig = GroundLinksRig(station.device, view_sysid=GHOST_SYSID)
     rig.run(3.0, heartbeat())
     ghost_messages = from_ghost(station.received())
     assert kinds(ghost_messages) == {"HEARTBEAT", "GPS_RAW_INT", "GLOBAL_POSITION_INT"}
@@ -168,8 +168,8 @@ def test_the_ghost_vehicle_is_sent_to_the_ground_and_not_to_the_autopilot(statio
     assert from_ghost(rig.wire.take()) == []
 
 
-def test_without_a_fix_the_ghost_vehicle_has_no_position(station: Station) -> None:
-    rig = Rig(station.device, view_sysid=GHOST_SYSID)
+def test_without_a_fix_the_ghost_vehicle_has_no_position(station: UdpStation) -> None:
+    rig = GroundLinksRig(station.device, view_sysid=GHOST_SYSID)
     rig.node.on = lambda _message: []  # type: ignore[method-assign]
     rig.run(2.0, heartbeat())
     ghost_messages = from_ghost(station.received())
@@ -178,8 +178,8 @@ def test_without_a_fix_the_ghost_vehicle_has_no_position(station: Station) -> No
     assert [x for x in ghost_messages if x.get_type() == "HEARTBEAT"][-1].system_status == mavlink.MAV_STATE_CRITICAL
 
 
-def test_the_ghost_vehicle_rejects_commands_and_an_origin_set_on_it_is_a_hint(station: Station) -> None:
-    rig = Rig(station.device, view_sysid=GHOST_SYSID)
+def test_the_ghost_vehicle_rejects_commands_and_an_origin_set_on_it_is_a_hint(station: UdpStation) -> None:
+    rig = GroundLinksRig(station.device, view_sysid=GHOST_SYSID)
     rig.run(1.2)
     station.received()
     arm = mavlink.MAVLink_command_long_message(GHOST_SYSID, 1, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, *(0.0,) * 6)
@@ -193,8 +193,8 @@ def test_the_ghost_vehicle_rejects_commands_and_an_origin_set_on_it_is_a_hint(st
     ]
 
 
-def test_a_ghost_vehicle_that_a_router_sends_back_is_not_an_autopilot(station: Station) -> None:
-    rig = Rig(station.device, view_sysid=GHOST_SYSID)
+def test_a_ghost_vehicle_that_a_router_sends_back_is_not_an_autopilot(station: UdpStation) -> None:
+    rig = GroundLinksRig(station.device, view_sysid=GHOST_SYSID)
     beat = mavlink.MAVLink_heartbeat_message(1, mavlink.MAV_AUTOPILOT_GENERIC, 0, 0, 4, 3)
     rig.receives(rig.now_ns, beat, sysid=GHOST_SYSID)
     rig.run(0.5)
@@ -221,7 +221,7 @@ def test_an_inconsistent_configuration_of_ground_links_raises(
         WiredEdge(**changes)
 
 
-def test_preflight_checks_the_ground_links(station: Station) -> None:
+def test_preflight_checks_the_ground_links(station: UdpStation) -> None:
     taken = f"udpin:127.0.0.1:{station.socket.getsockname()[1]}"
     by_status = {
         "ok": {"ground_devices": [station.device], "view_sysid": GHOST_SYSID},

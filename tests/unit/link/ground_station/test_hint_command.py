@@ -19,7 +19,7 @@ from terrafix_tools.hint.send import SUBSCRIBERS, hint
 pytestmark = pytest.mark.real_time
 
 
-class Flying:
+class HintListeners:
     """Stands for the processes that hear a hint; the anchor among them answers with ``verdict``."""
 
     def __init__(self, run: RunDir, verdict: Verdict | None) -> None:
@@ -69,9 +69,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunDir]:
 
 @pytest.mark.parametrize("verdict", [Verdict.ACCEPTED, Verdict.INNOVATION])
 def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verdict) -> None:
-    flying = Flying(run, verdict)
+    flying = HintListeners(run, verdict)
     try:
-        assert hint(48.1, -11.5, 3000.0) == "hint not used, 12 km from the estimate"
+        assert hint(48.1, -11.5, 3000.0, fix=(7, 5.5)) == "hint not used, 12 km from the estimate"
     finally:
         flying.land()
     (received,) = flying.hints
@@ -81,13 +81,14 @@ def test_a_hint_arrives_and_its_own_answer_comes_back(run: RunDir, verdict: Verd
         3000.0,
         "command line",
     )
+    assert (received.frame_id, received.sigma_m) == (7, 5.5)
 
 
 def test_without_a_frame_the_reply_states_that_the_hint_applies_to_the_next_one(
     run: RunDir, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(send, "ANSWER_S", 0.1)
-    flying = Flying(run, None)
+    flying = HintListeners(run, None)
     try:
         assert "it applies to the next one" in hint(48.1, 11.5, 3000.0, str(run.path))
     finally:

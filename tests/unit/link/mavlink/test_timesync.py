@@ -63,7 +63,7 @@ def test_a_date_off_by_one_week_counter_rollover_is_implausible() -> None:
             assert not gps_time.is_plausible(unix_ns(utc) + rounds * 1024 * 7 * 24 * 3600 * S)
 
 
-class Autopilot:
+class OtherClock:
     """Another clock behind a connection with delay; responds to TIMESYNC."""
 
     def __init__(self, offset_s: float, drift: float, seed: int = 0) -> None:
@@ -83,7 +83,7 @@ class Autopilot:
 
 @pytest.mark.parametrize("drift", [0.0, 40e-6, -40e-6])
 def test_timesync_follows_offset_and_drift_within_a_millisecond(drift: float) -> None:
-    sync, autopilot = TimeSync(), Autopilot(-1234.5, drift)
+    sync, autopilot = TimeSync(), OtherClock(-1234.5, drift)
     assert sync.to_local_ns(1) is None
     for second in range(5000, 5100):
         autopilot.exchange(sync, second * S)
@@ -95,14 +95,14 @@ def test_timesync_follows_offset_and_drift_within_a_millisecond(drift: float) ->
 
 
 def test_timesync_ignores_one_outlier_and_follows_a_reboot() -> None:
-    sync, autopilot = TimeSync(), Autopilot(500.0, 0.0)
+    sync, autopilot = TimeSync(), OtherClock(500.0, 0.0)
     for second in range(20):
         autopilot.exchange(sync, second * S, slow=0.0)
     before = sync.offset_at_ns(20 * S)
     assert before is not None
     sync.on_response(autopilot.time_ns(20 * S) + 3 * S, sync.request(20 * S), 20 * S + MS)
     assert sync.offset_at_ns(20 * S) == before
-    rebooted = Autopilot(-5.0, 0.0)
+    rebooted = OtherClock(-5.0, 0.0)
     for second in range(21, 30):
         rebooted.exchange(sync, second * S, slow=0.0)
     after = sync.offset_at_ns(30 * S)

@@ -61,19 +61,19 @@ def written(path: Path, bands: np.ndarray, grid: str, nodata: str | None = None,
     return path
 
 
-def covers_the_picture_and_not_its_collar(path: Path, grid: str, tmp_path: Path) -> list[bool]:
+def built_without_its_collar(path: Path, grid: str, tmp_path: Path) -> MapPackage:
+    """The package of ``path``, which covers the picture and not its collar."""
     package = MapPackage.open(build(path, tmp_path / "m.gpkg"))
     inside = [package.covers(*place(grid, column, row)) for column, row in ((50, 130), (200, 250), (370, 370))]
     collar = [package.covers(*place(grid, column, row)) for column, row in ((30, 30), (200, 50), (370, 90))]
-    package.close()
-    return [*inside, *(not covered for covered in collar)]
+    assert all(inside) and not any(collar)
+    return package
 
 
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("empty", [0, 255])
 def test_a_collar_is_found_on_every_grid(tmp_path: Path, grid: str, empty: int) -> None:
-    path = written(tmp_path / "i.tif", picture(empty), grid)
-    assert all(covers_the_picture_and_not_its_collar(path, grid, tmp_path))
+    built_without_its_collar(written(tmp_path / "i.tif", picture(empty), grid), grid, tmp_path)
 
 
 @pytest.mark.parametrize("grid", GRIDS)
@@ -86,8 +86,7 @@ def test_alpha_wins_over_nodata(tmp_path: Path, grid: str, nodata: str) -> None:
     alpha = np.full((1, SIDE_PX, SIDE_PX), 255, np.uint8)
     alpha[:, :COLLAR_PX] = 0
     path = written(tmp_path / "i.tif", np.concatenate([rgb, alpha]), grid, nodata, colorinterp=RGBA)
-    assert all(covers_the_picture_and_not_its_collar(path, grid, tmp_path))
-    package = MapPackage.open(build(path, tmp_path / "n.gpkg"))
+    package = built_without_its_collar(path, grid, tmp_path)
     assert package.covers(*place(grid, 200, 210)) and package.covers(*place(grid, 200, 250))
     text = package.manifest.inputs[0].text()
     assert ("alpha band is the mask" in text) if nodata in ("255", "0") else (f"{nodata} ignored, uint8 cannot" in text)
@@ -97,15 +96,14 @@ def test_alpha_wins_over_nodata(tmp_path: Path, grid: str, nodata: str) -> None:
 @pytest.mark.parametrize("nodata", ["-99", "nan", "256", "0.5"])
 def test_nodata_that_8_bits_cannot_hold_is_ignored_with_a_word(tmp_path: Path, grid: str, nodata: str) -> None:
     path = written(tmp_path / "i.tif", picture(), grid, nodata)
-    assert all(covers_the_picture_and_not_its_collar(path, grid, tmp_path))  # by the search for a collar
-    package = MapPackage.open(build(path, tmp_path / "n.gpkg"))
+    package = built_without_its_collar(path, grid, tmp_path)  # by the search for a collar
     assert f"nodata value {nodata} ignored, uint8 cannot hold it" in package.manifest.inputs[0].text()
 
 
 def test_a_nodata_value_that_16_bits_can_hold_counts(tmp_path: Path) -> None:
     bands = picture().astype(np.uint16) * 200
     path = map_rasters.write_tif(tmp_path / "i.tif", bands, *GRIDS["upright"], nodata=0)
-    assert all(covers_the_picture_and_not_its_collar(path, "upright", tmp_path))
+    built_without_its_collar(path, "upright", tmp_path)
 
 
 @pytest.mark.parametrize("grid", ["degrees", "rotated", "south-up"])

@@ -152,7 +152,8 @@ def test_the_area_outside_is_zero_and_invalid_with_sharp_edges(tmp_path: Path, h
     assert not package.covers(-80.0, 10.0)
     beyond = centre.to_wgs84(0.0, n_max + 80.0)
     assert not package.covers(*beyond)
-    assert package.covers_start(*beyond, 60.0) and not package.covers_start(*beyond, 10.0)
+    assert not package.covers_start(*beyond, 25.0)  # three sigma are 75 m, the map is 80 m away
+    assert all(package.covers_start(*beyond, sigma_m) for sigma_m in (28.0, 45.0, 90.0))  # by the 3rd, 2nd, 1st ring
     package.close()
 
 

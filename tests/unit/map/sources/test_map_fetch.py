@@ -23,7 +23,7 @@ from terrafix_tools.mapping.area.polygons import Placed
 from terrafix_tools.mapping.fetching import plan
 from terrafix_tools.mapping.fetching.fetch import Client, FetchError, RefusedError
 from terrafix_tools.mapping.fetching.pace import Limits
-from terrafix_tools.mapping.fetching.plan import Estimate
+from terrafix_tools.mapping.fetching.plan import FetchEstimate
 from terrafix_tools.mapping.fetching.tiles import MAX_CONSECUTIVE_FAILURES, TileDownload
 from terrafix_tools.mapping.sources.tiles.files import MbtilesReader
 from terrafix_tools.mapping.sources.tiles.grid import MERCATOR, Tile, TileRange, tiles_of
@@ -317,8 +317,8 @@ def test_a_tile_sample_is_an_evenly_spread_subset() -> None:
 def test_a_large_download_needs_confirmation_and_a_small_disk_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small, large = Estimate("s", 10, 10, 1e6, 5.0), Estimate("s", 99, 99, 3e9, 5.0)
-    slow = Estimate("s", 99, 99, 1e6, 7200.0)
+    small, large = FetchEstimate("s", 10, 10, 1e6, 5.0), FetchEstimate("s", 99, 99, 3e9, 5.0)
+    slow = FetchEstimate("s", 99, 99, 1e6, 7200.0)
     plan.check_consent([small], agreed=False)
     plan.check_consent([large, slow], agreed=True)
     with pytest.raises(UsageError, match=r"3\.0 GB in 5 s .*--yes"):

@@ -136,7 +136,7 @@ def test_missing_options_are_reported_before_the_download(tmp_path: Path) -> Non
             ({"source": []}, "--area needs a --source"),
             ({"gsd_m": 0.0}, "between 0.01 and 100"),
             ({"area": "13,47,13.1,47.1", "buffer_km": None, "corridor_km": 1.0}, "neither a mission nor a line"),
-            ({"area": "10,40,12,42"}, "at most 10,000"),
+            ({"area": "10,40,12,42"}, "at most 20,000"),
             ({"area": ""}, "give one image"),
             ({"area": "", "source": ["one.tif"], "buffer_km": None, "gsd_m": 0.0}, "need --area"),
             ({"source": [str(tmp_path / "none.tif")]}, "no such file"),

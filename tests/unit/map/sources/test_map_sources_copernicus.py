@@ -19,7 +19,12 @@ from terrafix_tools.mapping.fetching.fetch import FetchError, RefusedError
 from terrafix_tools.mapping.fetching.pace import Limits
 from terrafix_tools.mapping.package.dem import DemSource
 from terrafix_tools.mapping.sources.copernicus import data_space, glo30, sentinel
-from terrafix_tools.mapping.sources.copernicus.data_space import Copernicus, Credentials, Service, read_credentials
+from terrafix_tools.mapping.sources.copernicus.data_space import (
+    Copernicus,
+    Credentials,
+    DataSpaceService,
+    read_credentials,
+)
 from terrafix_tools.mapping.sources.spec import SourceSpec
 
 AREA = read_area("11.97,47.0,12.01,47.02", buffer_km=0.0)  # on the border of UTM zones 32 and 33
@@ -105,8 +110,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Copernicus.__init__, "__defaults__", (Limits(500.0, 2, first_wait_s=0.01),))
 
 
-def service(url: str) -> Service:
-    return Service(url + "/token", url + "/api")
+def service(url: str) -> DataSpaceService:
+    return DataSpaceService(url + "/token", url + "/api")
 
 
 def spec(**more: object) -> SourceSpec:

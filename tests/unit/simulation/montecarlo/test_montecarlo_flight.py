@@ -20,7 +20,7 @@ from terrafix_lab.montecarlo.faults import JUMP_M, JUMPS, Faults
 from terrafix_lab.montecarlo.flight import find_match, run
 from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight, fly
 from terrafix_lab.montecarlo.ground import MapError, Terrain
-from terrafix_lab.montecarlo.lens import Lens
+from terrafix_lab.montecarlo.lens import TrueLens
 from terrafix_lab.montecarlo.matches import MapMatches
 from terrafix_lab.montecarlo.plan import FlightPlan, plan
 from terrafix_lab.montecarlo.run import PICTURE, RESULT, RunOptions, montecarlo
@@ -71,10 +71,10 @@ def test_the_ground_is_the_same_from_another_origin() -> None:
 
 
 def test_rays_and_projection_of_a_lens_are_inverse() -> None:
-    lens = Lens(CameraCalibration(1280, 720, 684.0, 684.0, 639.5, 359.5), focal=0.02, k1=-0.01)
+    lens = TrueLens(CameraCalibration(1280, 720, 684.0, 684.0, 639.5, 359.5), focal=0.02, k1=-0.01)
     px = np.array([[0.0, 0.0], [639.5, 359.5], [1279.0, 719.0], [200.0, 600.0]])
     assert lens.project(40.0 * lens.rays(px)) == pytest.approx(px, abs=0.02)
-    true = Lens(lens.described)
+    true = TrueLens(lens.described)
     assert true.project(true.rays(px)) == pytest.approx(true.described.project(true.rays(px)))
 
 
@@ -83,7 +83,7 @@ def test_tracks_scatter_about_their_homography_as_those_of_real_flights(
 ) -> None:
     """village-1: 0.48 px after one frame, 0.77 after two, 0.84 after three, 0.9 later (medians, 720 px wide)."""
     drawn, flight = flown
-    lens = Lens(CameraCalibration.of(drawn.camera), drawn.focal_error, drawn.k1_error)
+    lens = TrueLens(CameraCalibration.of(drawn.camera), drawn.focal_error, drawn.k1_error)
     sightings, scatter = SimulatedOdometry(lens, flight.terrain, 1), {1: [], 2: [], 3: []}  # type: ignore[var-annotated]
     focal_px = lens.described.fx * 720 / lens.described.width
     for i, shot in enumerate(flight.frames):
@@ -158,7 +158,7 @@ def test_an_unusable_picture_tells_the_belief_nothing(flown: tuple[FlightPlan, S
 
 def test_only_a_repeated_view_is_static(flown: tuple[FlightPlan, SimulatedFlight]) -> None:
     drawn, flight = flown
-    sightings = SimulatedOdometry(Lens(CameraCalibration.of(drawn.camera)), flight.terrain, 1)
+    sightings = SimulatedOdometry(TrueLens(CameraCalibration.of(drawn.camera)), flight.terrain, 1)
     cruise = flight.frames[20:30]
     shown = [*cruise[:3], cruise[2], cruise[2], *cruise[3:]]
     assert [sightings.odometry(i, shot).static for i, shot in enumerate(shown)] == [i in (3, 4) for i in range(12)]
@@ -238,6 +238,7 @@ def test_an_unmapped_slope_is_not_taken_for_a_tilt_of_the_camera() -> None:
     assert float((seen.nees < 5.991).mean()) > 0.93
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_three_view_constraints_reduce_the_drift_over_hills_without_a_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two flights over relief of 20 m, 150 s without a map."""
@@ -293,7 +294,7 @@ def test_invalid_options_are_usage_errors(tmp_path: Path, wrong: dict[str, float
 
 
 def _matches(drawn: FlightPlan, flight: SimulatedFlight, offset_m: np.ndarray) -> MapMatches:
-    lens = Lens(CameraCalibration.of(drawn.camera))
+    lens = TrueLens(CameraCalibration.of(drawn.camera))
     error = MapError(drawn.seed, offset_m, 2.0)
     return MapMatches(lens, flight.terrain, error, has_dem=True, map_sigma_m=2.0, seed=drawn.seed)
 

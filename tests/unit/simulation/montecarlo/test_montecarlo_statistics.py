@@ -7,7 +7,7 @@ import pytest
 
 from terrafix_lab.montecarlo.endurance import RestartComparison, slopes
 from terrafix_lab.montecarlo.fault import DrawnFault
-from terrafix_lab.montecarlo.flight import run
+from terrafix_lab.montecarlo.flight import Run, run
 from terrafix_lab.montecarlo.plan import plan
 from terrafix_lab.montecarlo.statistics import band, draws_in, floors, whitened
 from terrafix_tools.score import nees_band, nees_of
@@ -118,12 +118,12 @@ def test_slopes_are_independent_of_the_load_of_the_machine(
 
 @pytest.mark.slow
 def test_a_restarted_estimator_processes_the_same_messages_and_agrees() -> None:
-    flight = RestartComparison(plan(1, 0, fault=DrawnFault.NONE, duration_s=60.0), 30.0)
-    alone = run(plan(1, 0, fault=DrawnFault.NONE, duration_s=60.0), refine=False)
-    record = flight.record(refine=False)
+    drawn, estimators = plan(1, 0, fault=DrawnFault.NONE, duration_s=60.0), RestartComparison(30.0)
+    alone = run(drawn, refine=False)
+    record = Run(drawn, estimators).record(refine=False)
     np.testing.assert_array_equal(record.error_m, alone.error_m)  # the output of the old one is unchanged
-    spent_ms = np.array(flight.frames_ms)
+    spent_ms = np.array(estimators.frames_ms)
     assert len(spent_ms) == (record.t_s > 30.0).sum() and (spent_ms > 0.0).all()
-    old, young = flight._node.estimator, flight._young.estimator
+    old, young = estimators.estimator, estimators.young.estimator  # type: ignore[union-attr]
     apart_m = old.last.pose.translation() - young.last.pose.translation()  # type: ignore[union-attr]
     assert np.hypot(*apart_m[:2]) < 3.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from terrafix.core.node import Image
 from terrafix_lab.accept.false_inputs import maps as lying_maps
-from terrafix_lab.accept.flight import Flight
+from terrafix_lab.accept.flight import AcceptFlight
 from terrafix_lab.accept.measuring.results import Marks
 from terrafix_lab.accept.plan import Plan
 from terrafix_lab.faults.edits import OriginEdit, Span, pause, photos, start_moved, unchanged_origin
@@ -26,11 +26,11 @@ PHOTO_M = 155.0
 GAP_FRAMES, GAP_MORE_S = 16, 170.0
 
 
-def _too_short(flight: Flight) -> str:
+def _too_short(flight: AcceptFlight) -> str:
     return "" if len(flight.frame_refs) >= MIN_FRAMES else f"the flight has only {len(flight.frame_refs)} frames"
 
 
-def _span(flight: Flight, first: int, last: int, text: str) -> Span:
+def _span(flight: AcceptFlight, first: int, last: int, text: str) -> Span:
     """From frame ``first`` to frame ``last``, both included; ``last`` is limited to the flight."""
     frame_refs = flight.frame_refs
     return Span(frame_refs[first].t_s, frame_refs[min(last, len(frame_refs) - 1)].t_s, text)
@@ -43,7 +43,7 @@ def _lying(span: Span, **plan: object) -> Plan:
 # --- pictures of another place ---
 
 
-def _another_camera(flight: Flight, numbers: list[int], pace: int = 1) -> Plan | str:
+def _another_camera(flight: AcceptFlight, numbers: list[int], pace: int = 1) -> Plan | str:
     """The frames ``numbers`` show pictures of another camera, which match each other and not the map: the flight's own,
     half of its frames later, mirrored. They advance at ``pace`` times the speed of the flight."""
     if why := _too_short(flight):
@@ -53,7 +53,7 @@ def _another_camera(flight: Flight, numbers: list[int], pace: int = 1) -> Plan |
     return _pictures_of(flight, shown, mirrored, "pictures of another place")
 
 
-def _pictures_of(flight: Flight, shown: dict[int, int], change: Callable[[Image], Image], text: str) -> Plan:
+def _pictures_of(flight: AcceptFlight, shown: dict[int, int], change: Callable[[Image], Image], text: str) -> Plan:
     """``shown``: index of a frame -> index of the frame whose picture it shows."""
 
     def load(number: int) -> Image:
@@ -63,28 +63,28 @@ def _pictures_of(flight: Flight, shown: dict[int, int], change: Callable[[Image]
     return _lying(_span(flight, min(shown), max(shown), text), edit=replaced(pictures))
 
 
-def foreign_row(at: float = START, pace: int = 1) -> Callable[[Flight], Plan | str]:
+def foreign_row(at: float = START, pace: int = 1) -> Callable[[AcceptFlight], Plan | str]:
     """From the share ``at`` of the frames on."""
 
-    def plan(flight: Flight) -> Plan | str:
+    def plan(flight: AcceptFlight) -> Plan | str:
         start = flight.at(at)
         return _another_camera(flight, list(range(start, start + FOREIGN_ROW)), pace)
 
     return plan
 
 
-def foreign_at_random(flight: Flight) -> Plan | str:
+def foreign_at_random(flight: AcceptFlight) -> Plan | str:
     drawn = np.random.default_rng([SEED, 70]).uniform(size=len(flight.frame_refs)) < FOREIGN_SHARE
     numbers = [int(n) for n in np.flatnonzero(drawn) if 0.1 <= n / len(flight.frame_refs) <= 0.8]
     return _another_camera(flight, numbers) if numbers else "too few frames to have a foreign one"
 
 
-def interleaved(flight: Flight) -> Plan | str:
+def interleaved(flight: AcceptFlight) -> Plan | str:
     start = flight.at(START)
     return _another_camera(flight, list(range(start, min(start + INTERLEAVED, flight.at(0.8)), 2)))
 
 
-def elsewhere_reversed(flight: Flight) -> Plan | str:
+def elsewhere_reversed(flight: AcceptFlight) -> Plan | str:
     """Ten pictures of the flight itself, from another part of the map, in reverse order."""
     if why := _too_short(flight):
         return why
@@ -102,12 +102,12 @@ def elsewhere_reversed(flight: Flight) -> Plan | str:
 
 def with_map(
     text: str,
-    change: Callable[[Flight, Path, Path], str],
+    change: Callable[[AcceptFlight, Path, Path], str],
     origin: OriginEdit = unchanged_origin,
-) -> Callable[[Flight], Plan | str]:
+) -> Callable[[AcceptFlight], Plan | str]:
     """``change`` (flight, map of the flight, map to write) makes the map of the scenario."""
 
-    def plan(flight: Flight) -> Plan | str:
+    def plan(flight: AcceptFlight) -> Plan | str:
         if not flight.has_raster_map:
             return "needs the map as a GeoTIFF, to change it"
         span = _span(flight, 0, len(flight.frame_refs) - 1, text)
@@ -116,17 +116,17 @@ def with_map(
     return plan
 
 
-def other_town(flight: Flight, given: Path, out: Path) -> str:
+def other_town(flight: AcceptFlight, given: Path, out: Path) -> str:
     if flight.other_map is not None:
         return lying_maps.put_in_place_of(flight.other_map, given, out)
     return lying_maps.mirrored(given, out)
 
 
-def shifted_map(by_m: tuple[float, float], _: Flight, given: Path, out: Path) -> str:
+def shifted_map(by_m: tuple[float, float], _: AcceptFlight, given: Path, out: Path) -> str:
     return lying_maps.shifted(given, out, *by_m)
 
 
-def grown_map(flight: Flight, given: Path, out: Path) -> str:
+def grown_map(flight: AcceptFlight, given: Path, out: Path) -> str:
     return lying_maps.scaled(
         given, out, 1.10, flight.truth[next(s.file for s in flight.frame_refs if s.file in flight.truth)]
     )
@@ -135,7 +135,7 @@ def grown_map(flight: Flight, given: Path, out: Path) -> str:
 # --- start, and true inputs with gaps ---
 
 
-def start_off(flight: Flight) -> Plan:
+def start_off(flight: AcceptFlight) -> Plan:
     """The lie is in the Origin only, so that its span is the first frame."""
     ahead = np.where(
         np.nanmean(flight.track_m(), axis=0) < 0.0, -1.0, 1.0
@@ -144,7 +144,7 @@ def start_off(flight: Flight) -> Plan:
     return _lying(_span(flight, 0, 0, "the start is 300 m off"), origin=start_moved(east_m, north_m, START_SIGMA_M))
 
 
-def sparse_photos(flight: Flight) -> Plan | str:
+def sparse_photos(flight: AcceptFlight) -> Plan | str:
     track = flight.track_m()
     chosen, last = [], None
     for number, place in enumerate(track):
@@ -154,7 +154,7 @@ def sparse_photos(flight: Flight) -> Plan | str:
     return Plan(photos(frozenset(chosen))) if len(chosen) >= 6 else f"only {len(chosen)} photos {PHOTO_M:.0f} m apart"
 
 
-def gap_of_minutes(flight: Flight) -> Plan | str:
+def gap_of_minutes(flight: AcceptFlight) -> Plan | str:
     if why := _too_short(flight):
         return why
     first = flight.at(START)

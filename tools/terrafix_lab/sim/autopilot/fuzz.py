@@ -14,13 +14,12 @@ import sys
 import tempfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.integrity.output_predictor import distance_m, offset
 from terrafix.link.node import TICK_HZ, LinkNode
-from terrafix.messages import CovarianceMode, GpsInput, NavEstimate, SourceLabel, VehicleState
+from terrafix.messages import CovarianceMode, GpsInput, Message, NavEstimate, SourceLabel, VehicleState
 from terrafix_lab.sim.autopilot.fuzz_wire import (
     KEY,
     MS,
@@ -35,6 +34,7 @@ from terrafix_lab.sim.autopilot.fuzz_wire import (
     transmit,
 )
 from terrafix_lab.sim.closed_loop.loopback import Loopback
+from terrafix_tools.in_process import InProcessShell
 
 S = 1_000_000_000
 STEP_NS = round(S / TICK_HZ)
@@ -42,7 +42,7 @@ LAT, LON, ALT_M, EAST_MPS = 48.0, 11.0, 620.0, 20.0
 
 
 @dataclass
-class Result:
+class FuzzResult:
     """``wrong``: 3D fixes more than 5 m from the truth; ``false_states``: attitudes that were not sent."""
 
     bytes: int = 0
@@ -60,7 +60,7 @@ class Result:
     wire: dict[str, float] = field(default_factory=dict)
 
 
-def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) -> Result:
+def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) -> FuzzResult:
     """Simulates a flight of ``seconds``."""
     with tempfile.TemporaryDirectory() as folder:
         key = Path(folder) / "key"
@@ -68,8 +68,10 @@ def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) 
         key.write_bytes(KEY)
         loopback = Loopback()
         edge = MavlinkEdge(LinkSection(signing_key=str(key) if signed else ""), loopback, lambda: UNIX_NS)
-    node, autopilot, rng = LinkNode(10.0), FuzzedAutopilot(signed), random.Random(seed)
-    result = Result(seconds=seconds, wire=asdict(wire))
+    published: list[Message] = []
+    shell = InProcessShell({"link": LinkNode(10.0)}, lambda _, message: published.append(message), edges={"link": edge})
+    autopilot, rng = FuzzedAutopilot(signed), random.Random(seed)
+    result = FuzzResult(seconds=seconds, wire=asdict(wire))
     steps = round(seconds * TICK_HZ)
     delayed: list[bytes] = []
     last_sent_ns: int | None = None
@@ -83,27 +85,21 @@ def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) 
         for piece in split(chunk, rng):
             loopback.to_companion(piece)
         if step % 25 == 5:
-            _feed(node, _estimate(now_ns - 100 * MS, now_ns))
-        for message in edge.poll(now_ns):
+            shell.feed(_estimate(now_ns - 100 * MS, now_ns))
+        shell.step(now_ns)
+        for message in published:
             if isinstance(message, VehicleState):
                 result.states += 1
                 result.false_states += not _true_state(message)
-            _feed(node, message)
-        for output in node.tick(now_ns):
-            edge.on_message(output)
-            if isinstance(output, GpsInput):
-                _check_output(output, result)
+            elif isinstance(message, GpsInput):
+                _check_output(message, result)
                 if last_sent_ns is not None:
                     result.longest_gap_ms = max(result.longest_gap_ms, (now_ns - last_sent_ns) / MS)
                 last_sent_ns = now_ns
+        published.clear()
     status = edge.status.snapshot(steps * STEP_NS)
     result.packets_taken, result.bytes_skipped, result.refused = status.received, status.bad, status.refused
     return result
-
-
-def _feed(node: LinkNode, message: Any) -> None:
-    for _ in node.on(message):
-        pass
 
 
 def _estimate(t_ns: int, emitted_ns: int) -> NavEstimate:
@@ -133,7 +129,7 @@ def _true_state(state: VehicleState) -> bool:
     return all(a is not None and abs(a - b) < 1e-6 for a, b in zip(attitude, (YAW, PITCH, ROLL), strict=True))
 
 
-def _check_output(output: GpsInput, result: Result) -> None:
+def _check_output(output: GpsInput, result: FuzzResult) -> None:
     result.sent += 1
     if output.fix_type != 3:
         return

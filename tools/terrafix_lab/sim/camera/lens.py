@@ -8,6 +8,7 @@ import numpy as np
 
 from terrafix import messages as m
 from terrafix.core.camera import CameraCalibration
+from terrafix.vision.sources.fisheye import FisheyeCamera
 
 NEWTON_STEPS = 12  # Newton steps; the angle of a real lens converges in five
 
@@ -89,4 +90,7 @@ class Fisheye:
 
 def lens_of(camera: m.Camera) -> Lens:
     """Returns the lens model of a camera description."""
+    if isinstance(camera, FisheyeCamera):
+        k1, k2, k3, k4 = camera.distortion
+        return Fisheye(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, (k1, k2, k3, k4))
     return Pinhole(CameraCalibration.of(camera))

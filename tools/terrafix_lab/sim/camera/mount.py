@@ -15,7 +15,7 @@ WANDER_S = (2.3, 5.9, 13.7)  # periods of a gimbal's error, from fast correction
 
 
 @dataclass(frozen=True)
-class Motion:
+class CameraMotion:
     """Velocity and angular rate of the camera at the time of an image, constant during the exposure."""
 
     velocity_enu_mps: np.ndarray  # (3,)
@@ -37,7 +37,7 @@ class CameraMount(Protocol):
     def r_w_c(self, state: State) -> np.ndarray:
         """R_w_c (3, 3)."""
 
-    def motion(self, state: State) -> Motion: ...
+    def motion(self, state: State) -> CameraMotion: ...
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Fixed:
     def r_w_c(self, state: State) -> np.ndarray:
         return state.r_w_b() @ self.mount.r_b_c()
 
-    def motion(self, state: State) -> Motion:
-        return Motion(state.velocity_enu_mps, self.mount.r_b_c().T @ state.rates_b_radps)
+    def motion(self, state: State) -> CameraMotion:
+        return CameraMotion(state.velocity_enu_mps, self.mount.r_b_c().T @ state.rates_b_radps)
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Gimbal:
         pitch_rad, roll_rad = np.radians(self.error_deg) * waves / math.sqrt(len(WANDER_S) / 2)
         return rot_w_b(state.yaw_rad, float(pitch_rad), float(roll_rad)) @ self.mount.r_b_c()
 
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: State) -> CameraMotion:
         """Turns with the heading (Euler's kinematic equation); the gimbal's own corrections are negligible."""
         _, q, r = (float(v) for v in state.rates_b_radps)
         yaw_rate_radps = (q * math.sin(state.roll_rad) + r * math.cos(state.roll_rad)) / math.cos(state.pitch_rad)
-        return Motion(state.velocity_enu_mps, self.r_w_c(state).T @ np.array([0.0, 0.0, -yaw_rate_radps]))
+        return CameraMotion(state.velocity_enu_mps, self.r_w_c(state).T @ np.array([0.0, 0.0, -yaw_rate_radps]))

@@ -14,13 +14,13 @@ from terrafix import messages as m
 from terrafix_lab.sim.camera.film import Developer, Film
 from terrafix_lab.sim.camera.grid import GRID_PX, Dense, Grid, cell_steps, sample_image
 from terrafix_lab.sim.camera.lens import Lens, lens_of
-from terrafix_lab.sim.camera.mount import Motion
+from terrafix_lab.sim.camera.mount import CameraMotion
 from terrafix_lab.sim.camera.weather import AIR_BGR, CLOUD_BGR, Sky, Weather, blend
 from terrafix_lab.sim.ground.detail import DETAIL_M, NEUTRAL, detail
 from terrafix_lab.sim.ground.draped_image import Ground, drape, open_ground
 from terrafix_lab.sim.ground.relief import VIEW_M
 
-__all__ = ["Film", "Ground", "Motion", "Renderer", "Weather", "drape", "open_ground"]
+__all__ = ["CameraMotion", "Film", "Ground", "Renderer", "Weather", "drape", "open_ground"]
 
 MAX_SCALE_RATIO = 1.5  # ratio of the coarsest to the finest ground pixel above which the frame is sampled in blocks
 BLOCK = 8  # side of a block in grid cells
@@ -32,7 +32,7 @@ CURVATURE_MAX_DISTANCE_M = 3000.0  # beyond this distance curvature of the groun
 CURVATURE_PX = 1.0  # a cell whose centre deviates by more gets one ray per pixel
 FLOW_S = 1e-3  # time step of the flow's difference quotient
 FILM, CLEAR = Film(), Weather()
-STILL = Motion(np.zeros(3), np.zeros(3))
+STILL = CameraMotion(np.zeros(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class View:
 
     p_c_in_w_m: np.ndarray  # (3,) at the middle row
     r_w_c: np.ndarray  # (3, 3)
-    motion: Motion
+    motion: CameraMotion
     from_m: np.ndarray  # (rows, 1, 3): with a rolling shutter every row has its own camera position
     rays: np.ndarray  # (rows, columns, 3) unit, in w
     distance_m: np.ndarray  # (rows, columns)
@@ -72,7 +72,7 @@ class Renderer:
         self._detail = detail(seed, film.detail) if film.detail else None
 
     def frame(
-        self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray, index: int, *, t_s: float = 0.0, motion: Motion = STILL
+        self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray, index: int, *, t_s: float = 0.0, motion: CameraMotion = STILL
     ) -> np.ndarray:
         """Returns image number ``index`` of the flight: (H, W, 3) uint8 BGR. p_c_in_w_m (3,), r_w_c (3, 3).
 
@@ -84,7 +84,7 @@ class Renderer:
         return self._developer.develop(self._with_weather(self._scene(view), view, t_s), index, flow)
 
     def ideal(
-        self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray, *, t_s: float = 0.0, motion: Motion = STILL
+        self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray, *, t_s: float = 0.0, motion: CameraMotion = STILL
     ) -> np.ndarray:
         """Returns the scene through lens and air, without sensor model: (H, W, 3) uint8."""
         view = self._view(p_c_in_w_m, r_w_c, motion)
@@ -94,7 +94,7 @@ class Renderer:
         """Returns the intersections of the coarse grid's rays with the ground: (rows, columns, 3) east, north, up."""
         return self._view(p_c_in_w_m, r_w_c, STILL).points_m
 
-    def _view(self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray, motion: Motion) -> View:
+    def _view(self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray, motion: CameraMotion) -> View:
         from_m, rotations = motion.pose(p_c_in_w_m, r_w_c, self._row_times_s(self._grid.row_px))
         rays = np.einsum("rij,rcj->rci", rotations, self._rays_in_c)
         from_m = from_m[:, None, :]

@@ -11,7 +11,7 @@ from terrafix.core.errors import EvaluationError, SourceError, UsageError
 from terrafix_lab.sim.autopilot.parameters import Gps
 from terrafix_lab.sim.autopilot.verdict import gps_input_failure, key_figures, number
 from terrafix_lab.sim.closed_loop.flight import Conditions, check_rates, plan_over
-from terrafix_lab.sim.closed_loop.loop import Flown, Plan, fly
+from terrafix_lab.sim.closed_loop.loop import Flown, LoopPlan, fly
 from terrafix_lab.sim.flights.make import FlightOptions, check_options, gnss_events, scene_of, write_map
 from terrafix_lab.sim.out_folder import prepare_folder
 from terrafix_lab.sim.sensors.gnss_events import AnyEvent, Drag, Jam
@@ -83,7 +83,7 @@ def _events(request: Request) -> tuple[AnyEvent, ...]:
     return tuple(events) or (Jam(start_s=JAM_AFTER_S),)
 
 
-def _fly(plan: Plan, out: Path, console: Console) -> Flown:
+def _fly(plan: LoopPlan, out: Path, console: Console) -> Flown:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} s of the flight"))
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task(plan.name, total=None)

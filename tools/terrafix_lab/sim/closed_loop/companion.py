@@ -15,14 +15,11 @@ from terrafix.link.edge import MavlinkEdge
 from terrafix.link.mavlink.transport import Transport
 from terrafix.messages import (
     Frame,
-    GpsInput,
     Message,
     NavEstimate,
     Origin,
-    PositionSource,
     Prediction,
     SourceEnded,
-    StatusText,
     TemperatureZone,
     ThermalReading,
 )
@@ -97,11 +94,10 @@ class Companion:
         nodes: dict[str, Node] = {
             p.name: importlib.import_module(p.module).make_node(ctx) for p in PROCESSES if p.name in PROCESS_NAMES
         }
-        self._link = nodes["link"]
         self._anchor = DelayedNode(nodes["anchor"], round(delays.anchor_s * 1e9))
-        self._shell = InProcessShell({**nodes, "anchor": self._anchor}, self._sink)
-        self._frames, self._on_messages = frames, on_messages
         self._edge = MavlinkEdge(ctx.config.link, transport, lambda: UNIX_NS_AT_ZERO + self._now_ns)
+        self._shell = InProcessShell({**nodes, "anchor": self._anchor}, self._sink, edges={"link": self._edge})
+        self._frames, self._on_messages = frames, on_messages
         self._vision_ns = round(delays.vision_s * 1e9)
         self._queue: deque[Frame] = deque()
         self._published: list[Message] = []
@@ -129,10 +125,7 @@ class Companion:
 
     def step(self, now_ns: int) -> None:
         self._now_ns = self._anchor.now_ns = now_ns
-        for message in self._edge.poll(now_ns):
-            self._shell.feed(message)
-            for answer in self._link.on(message):  # the edge's messages also go to the node of its own process
-                self._shell.feed(answer)
+        self._shell.poll(now_ns)
         while self._queue and now_ns - self._queue[0].t_ns >= self._vision_ns:
             self._shell.feed(self._queue.popleft())
         for message in self._anchor.ready_outputs():
@@ -157,9 +150,7 @@ class Companion:
 
     def _sink(self, _who: str, message: Message) -> None:
         self._published.append(message)
-        if isinstance(message, GpsInput | PositionSource | StatusText):
-            self._edge.on_message(message)
-        elif isinstance(message, NavEstimate):
+        if isinstance(message, NavEstimate):
             self.estimated_ns[message.frame_id] = self._now_ns
 
     def _flush(self) -> None:

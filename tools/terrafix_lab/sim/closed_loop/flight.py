@@ -17,7 +17,7 @@ from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.autopilot.parameters import BESIDE_A_RECEIVER, GPS_INPUT_ALONE, NO_DCM, Gps, Kind
 from terrafix_lab.sim.camera.render import Film, Renderer, Weather
 from terrafix_lab.sim.closed_loop.companion import Delays
-from terrafix_lab.sim.closed_loop.loop import Plan
+from terrafix_lab.sim.closed_loop.loop import LoopPlan
 from terrafix_lab.sim.flights.folder import (
     AGL_M,
     AGL_SIGMA_M,
@@ -71,7 +71,7 @@ def plan_over(
     gps: Gps = Gps.SECOND,
     conditions: Conditions | None = None,
     config: Config | None = None,
-) -> Plan:
+) -> LoopPlan:
     """Builds the plan of a flight to the end of ``mission`` (None: a course of ``length_m``), or for ``duration_s``.
 
     ``config``: of the companion; ``gps`` sets its GPS number. Raises UsageError, SourceError."""
@@ -95,7 +95,7 @@ def plan_over(
         parameters=parameters_of(kind, gps),
         boot_ns=Clock.of(seed).boot_ns,
     )
-    return Plan(
+    return LoopPlan(
         name=f"closed loop, {mission.name}",
         frame=scene.frame,
         vehicle=vehicle,

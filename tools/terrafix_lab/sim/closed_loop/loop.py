@@ -40,7 +40,7 @@ Progress = Callable[[float], None]  # seconds of the flight
 
 
 @dataclass(frozen=True)
-class Plan:
+class LoopPlan:
     """Everything that a closed-loop flight consists of."""
 
     name: str
@@ -68,7 +68,7 @@ class Flown:
     peer: PeerReport
 
 
-def fly(plan: Plan, out: Path, *, progress: Progress = lambda _: None) -> Flown:
+def fly(plan: LoopPlan, out: Path, *, progress: Progress = lambda _: None) -> Flown:
     """Writes estimates.csv, flight.mcap, summary.json, truth.csv, track.csv and peer.json into ``out``.
 
     Raises OutputError, and the nodes' errors for a bad map or model.
@@ -99,7 +99,7 @@ def fly(plan: Plan, out: Path, *, progress: Progress = lambda _: None) -> Flown:
 
 
 class _Loop:
-    def __init__(self, plan: Plan, out: Path, output: ReplayOutput) -> None:
+    def __init__(self, plan: LoopPlan, out: Path, output: ReplayOutput) -> None:
         self._plan, self._output = plan, output
         frames = MemoryFrameStore(FRAMES_KEPT)
         ctx = NodeContext(config=plan.config, frames=frames, map_path=plan.map_path.resolve(), out_dir=out.resolve())

@@ -26,7 +26,6 @@ from terrafix.vision.sources.description import (
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.camera.render import Film, Ground, Renderer
-from terrafix_lab.sim.flights.description import write_toml
 from terrafix_lab.sim.flights.log import T0_US, TelemetryLog
 from terrafix_lab.sim.flights.path import FlownPath, fly
 from terrafix_lab.sim.flights.scene import Scene, scene_of_world
@@ -38,6 +37,7 @@ from terrafix_lab.sim.vehicle.copter import Copter
 from terrafix_lab.sim.vehicle.plane import Plane
 from terrafix_lab.sim.vehicle.wind import BREEZE, Wind
 from terrafix_lab.sim.world.place import World
+from terrafix_tools.camera.description import write_toml
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.items import Mission, check
 
@@ -74,6 +74,7 @@ class Flight:
     ground_amsl_m: float  # under the start: zero of the reported height
     duration_s: float
     frame_hz: float = FRAME_HZ  # of the camera
+    camera: m.Camera = CAMERA
 
     def frame_times_s(self) -> np.ndarray:
         """Exposure times, from zero."""
@@ -81,7 +82,7 @@ class Flight:
 
     def camera_pose(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Returns p_c_in_w_m (3,) and R_w_c (3, 3)."""
-        return state.p_b_in_w_m, state.r_w_b() @ Mount.of(CAMERA).r_b_c()
+        return state.p_b_in_w_m, state.r_w_b() @ Mount.of(self.camera).r_b_c()
 
 
 def plan_flight(place: World, camera_image_bgr: np.ndarray, duration_s: float, frame_hz: float = FRAME_HZ) -> Flight:
@@ -163,7 +164,7 @@ def write_flight(
 
     ``map_name`` is relative to the folder. Raises OutputError.
     """
-    renderer = Renderer(flight.ground, CAMERA, film=Film(), seed=seed)
+    renderer = Renderer(flight.ground, flight.camera, film=Film(), seed=seed)
     times = flight.frame_times_s()
     frame_rows, truth = [], []
     try:
@@ -211,12 +212,12 @@ def _write_jpeg(path: Path, image: np.ndarray) -> None:
 
 def _describe(flight: Flight, map_name: str) -> Description:
     lat_deg, lon_deg = (round(v, 7) for v in flight.start_wgs84)
-    c = CAMERA
+    c = flight.camera
     return Description(
         name=f"simulated {flight.kind}",
         map=map_name,
         camera=CameraTable.of(c),
-        mount=MountTable(tolerance_deg=c.mount_tolerance_deg),
+        mount=MountTable.of(c),
         start=StartTable(
             lat_deg=lat_deg, lon_deg=lon_deg, ground_amsl_m=round(flight.ground_amsl_m, 1), sigma_m=START_SIGMA_M
         ),

@@ -20,7 +20,6 @@ from terrafix.vision.sources.description import Description, read_description
 from terrafix.vision.sources.table import read_table as read_frames
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.autopilot.parameters import Kind
-from terrafix_lab.sim.flights.description import write_toml
 from terrafix_lab.sim.flights.log import T0_US, TelemetryLog
 from terrafix_lab.sim.flights.path import STEP_S, FlownPath, fly
 from terrafix_lab.sim.flights.smooth import Curve, smooth
@@ -28,6 +27,7 @@ from terrafix_lab.sim.interfaces import Navigation, State, navigation_of
 from terrafix_lab.sim.sensors.clock import Clock
 from terrafix_lab.sim.sensors.suite import VehicleSensors
 from terrafix_lab.sim.vehicle.motion import Motion
+from terrafix_tools.camera.description import write_toml
 from terrafix_tools.estimates import number, read_table
 
 MIN_FRAMES = 4  # least number of frames with truth for a fit

@@ -20,6 +20,7 @@ from terrafix.messages import (
     GnssState,
     GnssVerdict,
     GpsInput,
+    Message,
     NavEstimate,
     SourceLabel,
     VehicleState,
@@ -27,6 +28,7 @@ from terrafix.messages import (
 from terrafix_lab.sim.interfaces import GnssFix, State
 from terrafix_lab.sim.sensors.gnss import DELAY_S, Gnss
 from terrafix_lab.sim.sensors.gnss_events import AnyEvent
+from terrafix_tools.in_process import InProcessShell
 
 STEP_S = 0.2  # period of receiver readings, attitude and the link's tick
 ESTIMATES_S = 0.4
@@ -68,7 +70,8 @@ def fly(
     """Simulates one flight. ``map_offset``: the map's offset is estimated from the receiver."""
     rng = random.Random(f"{seed} judge")
     gnss = Gnss(FRAME, seed=seed, events=events)
-    node = LinkNode(10.0, map_offsets=MapOffsetEstimator() if map_offset else None)
+    node, outputs = LinkNode(10.0, map_offsets=MapOffsetEstimator() if map_offset else None), list[Message]()
+    shell = InProcessShell({"link": node}, lambda _, message: outputs.append(message))
     trajectory, estimator, result = _Trajectory(rng), _Estimator(vision, rng), DetectorResult()
     pending: list[tuple[float, NavEstimate]] = []
     previous_state: GnssState | None = None
@@ -81,14 +84,14 @@ def fly(
             result.lost_fix_s = t_s - DELAY_S
         if step % round(ESTIMATES_S / STEP_S) == 0:
             pending.append((t_s + ESTIMATE_DELAY_S, estimator.estimate(state)))
-        outputs = []
+        outputs.clear()
         while pending and pending[0][0] <= t_s:
-            node.on(pending.pop(0)[1])
+            shell.feed(pending.pop(0)[1])
         now_ns = round(t_s * NS_PER_S)
-        node.on(_attitude(state, now_ns))
+        shell.feed_read("link", _attitude(state, now_ns))
         if fix is not None:
-            outputs += list(node.on(_reading(fix, now_ns)))
-        outputs += list(node.tick(now_ns))
+            shell.feed_read("link", _reading(fix, now_ns))
+        shell.tick(now_ns)
         for message in outputs:
             if isinstance(message, GnssVerdict) and message.state is not previous_state:
                 previous_state = message.state

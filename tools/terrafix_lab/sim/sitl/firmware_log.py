@@ -5,18 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafix.core.autopilot_log.dataflash import Table, read_dataflash
 from terrafix.link.gnss.source_switch import AUTO_SWITCH, PRIMARY
 from terrafix.link.integrity.output_predictor import distance_m
 from terrafix_lab.sim.sitl.report import FIX_3D
 from terrafix_tools.autopilot_log.ardupilot import ARMED, DISARMED
-from terrafix_tools.autopilot_log.dataflash import Table, read_dataflash
 from terrafix_tools.score import longest_gap_s
 
 POSITION_SOURCE = (AUTO_SWITCH, PRIMARY)  # what `link.gnss = "act"` sets
 
 
 @dataclass(frozen=True)
-class Receiver:
+class FirmwareReceiver:
     """One GPS of the firmware, from arming to disarming."""
 
     fix_share: float  # share of the GPS messages with a 3D fix
@@ -34,7 +34,7 @@ class FirmwareFigures:
     position_median_m: float | None
     position_p95_m: float | None
     position_max_m: float | None
-    receivers: dict[str, Receiver]  # by number, "1" and "2"
+    receivers: dict[str, FirmwareReceiver]  # by number, "1" and "2"
     errors: list[str]  # ERR messages: second since arming, subsystem and code (AP_Logger.h, LogErrorSubsystem)
     parameters: dict[str, float]  # position source parameters at the end
 
@@ -101,9 +101,9 @@ def _position_errors_m(positions: Table | None, truth: Table | None) -> np.ndarr
     return np.array([distance_m(*place) for place in zip(*own, *true, strict=True)])
 
 
-def _receiver(table: Table) -> Receiver:
+def _receiver(table: Table) -> FirmwareReceiver:
     fixed = table.column("Status") >= FIX_3D
-    return Receiver(
+    return FirmwareReceiver(
         fix_share=float(fixed.mean()),
         longest_gap_s=longest_gap_s(table.t_s[fixed].tolist(), float(table.t_s[0]), float(table.t_s[-1])),
         used_share=float((table.column("U") == 1.0).mean()),

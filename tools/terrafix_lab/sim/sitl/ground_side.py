@@ -23,7 +23,7 @@ FRAMES = {AltitudeFrame.SEA: 0, AltitudeFrame.HOME: 3, AltitudeFrame.GROUND: 10}
 TAKE_OFF_PITCH_DEG = 12.0  # least pitch of a plane until the height is reached; a copter ignores it
 
 
-class Ground:
+class GroundSide:
     """Connection to one autopilot. Raises LinkError when a command fails."""
 
     def __init__(self, system: Any) -> None:
@@ -59,7 +59,7 @@ class Ground:
 
 
 @contextmanager
-def connected(port: int) -> Iterator[Ground]:
+def connected(port: int) -> Iterator[GroundSide]:
     """Connects to the autopilot that sends to UDP ``port`` of this machine. Raises LinkError: port taken, or no
     autopilot.
     """
@@ -72,7 +72,7 @@ def connected(port: int) -> Iterator[Ground]:
         system = station.first_autopilot(DISCOVERY_TIMEOUT_S)
         if system is None:
             raise LinkError(f"no autopilot sent to UDP port {port} within {DISCOVERY_TIMEOUT_S:.0f} s")
-        yield Ground(system)
+        yield GroundSide(system)
 
 
 def items(mission: Mission) -> list[MissionItem]:

@@ -14,7 +14,7 @@ from terrafix_tools.mission.items import Mission
 
 
 @dataclass(frozen=True)
-class Scene:
+class SitlScene:
     frame: LocalFrame
     ground: Ground  # as the camera sees it
     home: Home
@@ -22,7 +22,7 @@ class Scene:
     map_path: Path
 
 
-def generate_scene(out: Path, place: World, mission: Mission) -> Scene:
+def generate_scene(out: Path, place: World, mission: Mission) -> SitlScene:
     """Writes the map into ``out`` and returns the scene. Raises OutputError."""
     map_path = out / "map.gpkg"
     write_map(place, map_path, ce90_m=None)  # stated as for a real map
@@ -30,6 +30,6 @@ def generate_scene(out: Path, place: World, mission: Mission) -> Scene:
     camera_scene = scene_of_world(place, place.render(CAMERA_SEASON))
     lat_deg, lon_deg = place_of(place)
     home_amsl_m = camera_scene.height()(*camera_scene.frame.to_local(lat_deg, lon_deg))
-    return Scene(
+    return SitlScene(
         camera_scene.frame, camera_scene.ground, Home(lat_deg, lon_deg, home_amsl_m, HEADING_DEG), mission, map_path
     )

@@ -15,16 +15,16 @@ from rich.console import Console
 
 from terrafix.core.errors import LinkError, OutputError
 from terrafix.vision.sources.description import CameraTable, Description, MountTable, StartTable, TelemetryTable
-from terrafix_lab.sim.flights.description import write_toml
 from terrafix_lab.sim.flights.folder import AGL_SIGMA_M, ATTITUDE_SIGMA_DEG, CAMERA, YAW_SIGMA_DEG
 from terrafix_lab.sim.sitl.camera import SimulatedCamera
 from terrafix_lab.sim.sitl.firmware import Firmware
 from terrafix_lab.sim.sitl.firmware_log import POSITION_SOURCE
-from terrafix_lab.sim.sitl.ground_side import Ground
+from terrafix_lab.sim.sitl.ground_side import GroundSide
 from terrafix_lab.sim.sitl.observer import Observer
 from terrafix_lab.sim.sitl.report import FIX_3D, Interruption, Times
-from terrafix_lab.sim.sitl.scene import Scene
+from terrafix_lab.sim.sitl.scene import SitlScene
 from terrafix_tools import child_process
+from terrafix_tools.camera.description import write_toml
 
 GPS_ID = 1  # Terrafix is the second GPS
 BOOT_S = 120.0  # time-out until the filter has a position
@@ -59,7 +59,14 @@ class Daemon:
     """
 
     def __init__(
-        self, out: Path, scene: Scene, source: str, link: str, *, start_configured: bool = True, gnss: str = "advise"
+        self,
+        out: Path,
+        scene: SitlScene,
+        source: str,
+        link: str,
+        *,
+        start_configured: bool = True,
+        gnss: str = "advise",
     ) -> None:
         """``start_configured``: the camera description contains the start. ``gnss``: link.gnss. Raises OutputError."""
         self._process: subprocess.Popen[bytes] | None = None
@@ -113,11 +120,11 @@ class Stages:
     def __init__(
         self,
         firmware: Firmware,
-        station: Ground,
+        station: GroundSide,
         observer: Observer,
         daemon: Daemon,
         camera: SimulatedCamera,
-        scene: Scene,
+        scene: SitlScene,
         console: Console,
     ) -> None:
         self._firmware, self._station, self._observer, self._camera = firmware, station, observer, camera
@@ -276,7 +283,7 @@ def _description(start: StartTable | None) -> Description:
     return Description(
         name="ardupilot",
         camera=CameraTable.of(CAMERA),
-        mount=MountTable(pitch_deg=CAMERA.mount_pitch_deg, tolerance_deg=CAMERA.mount_tolerance_deg),
+        mount=MountTable.of(CAMERA),
         start=start,
         telemetry=TelemetryTable(
             yaw_sigma_deg=YAW_SIGMA_DEG, agl_sigma_m=AGL_SIGMA_M, attitude_sigma_deg=ATTITUDE_SIGMA_DEG

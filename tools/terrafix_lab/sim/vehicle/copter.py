@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix_lab.sim.interfaces import Navigation, State, navigation_of
-from terrafix_lab.sim.vehicle.copter_guidance import Guidance
+from terrafix_lab.sim.vehicle.copter_guidance import CopterGuidance
 from terrafix_lab.sim.vehicle.motion import AIRBORNE_M, GRAVITY_MPS2, Motion
 from terrafix_lab.sim.vehicle.wind import BREEZE, Gusts, Wind
 from terrafix_tools.mission.items import HeightOf, Mission
@@ -50,7 +50,7 @@ class Copter:
         limits: CopterLimits = CopterLimits(),
     ) -> None:
         self._wind, self._limits, self._gusts = wind, limits, Gusts(wind, seed)
-        self._guidance = Guidance(mission, frame, height, limits.cruise_mps, limits.accel_mps2)
+        self._guidance = CopterGuidance(mission, frame, height, limits.cruise_mps, limits.accel_mps2)
         e_m, n_m, self._yaw_rad = self._guidance.start()
         ground_m = height(e_m, n_m)
         self._on_ground, self._landed = mission.starts_on_ground(), False

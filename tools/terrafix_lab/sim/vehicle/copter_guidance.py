@@ -17,7 +17,7 @@ LOITER_RADIUS_M = 20.0
 RETURN_HEIGHT_M = 15.0  # RTL_ALT: least height above home
 
 
-class Guidance(MissionGuidance):
+class CopterGuidance(MissionGuidance):
     """Guidance of the multicopter; see MissionGuidance."""
 
     return_height_m = RETURN_HEIGHT_M

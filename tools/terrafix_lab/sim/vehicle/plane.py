@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from terrafix.core.geodesy import LocalFrame
 from terrafix_lab.sim.interfaces import Navigation, State, navigation_of
 from terrafix_lab.sim.vehicle.motion import AIRBORNE_M, GRAVITY_MPS2, Motion
-from terrafix_lab.sim.vehicle.plane_guidance import Guidance, GuidanceCommand
+from terrafix_lab.sim.vehicle.plane_guidance import GuidanceCommand, PlaneGuidance
 from terrafix_lab.sim.vehicle.wind import BREEZE, Gusts, Wind
 from terrafix_tools.mission.items import HeightOf, Mission
 
@@ -56,7 +56,7 @@ class Plane:
         limits: PlaneLimits = PlaneLimits(),
     ) -> None:
         self._wind, self._limits, self._gusts = wind, limits, Gusts(wind, seed)
-        self._guidance = Guidance(mission, frame, height, limits.cruise_mps, limits.bank_rad)
+        self._guidance = PlaneGuidance(mission, frame, height, limits.cruise_mps, limits.bank_rad)
         e_m, n_m, self._heading_rad = self._guidance.start()
         self._speed_mps = limits.cruise_mps
         self._roll_rad = self._roll_rate_radps = self._climb_mps = 0.0

@@ -32,7 +32,7 @@ class GuidanceCommand:
     landing: bool = False
 
 
-class Guidance(MissionGuidance):
+class PlaneGuidance(MissionGuidance):
     """Guidance of the fixed wing; see MissionGuidance."""
 
     return_height_m = RETURN_HEIGHT_M

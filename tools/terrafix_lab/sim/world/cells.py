@@ -14,7 +14,7 @@ import numpy as np
 from terrafix_lab.sim.world.noise import smooth
 from terrafix_lab.sim.world.places import farms, orchard, row_of_trees, scattered, village, wood
 from terrafix_lab.sim.world.rivers import from_bank_m, rivers
-from terrafix_lab.sim.world.shapes import House, Line, Parcel, Warp, densify, divide, long_axis
+from terrafix_lab.sim.world.shapes import House, Line, Parcel, PlanWarp, densify, divide, long_axis
 
 CELL_M = 1500.0
 MAX_CORNER_OFFSET_M = 0.2 * CELL_M  # largest offset of a corner from the square grid
@@ -54,7 +54,7 @@ def cells_around(x0_m: float, y0_m: float, x1_m: float, y1_m: float) -> list[tup
 def cell(seed: int, i: int, j: int) -> Cell:
     """Returns the plan of cell (i, j); it shares corners and edges with its neighbours."""
     rng = np.random.default_rng([seed, 4, i % 2**32, j % 2**32])
-    warp = Warp(np.random.default_rng([seed, 0]))
+    warp = PlanWarp(np.random.default_rng([seed, 0]))
     corners = [_corner(seed, i + a, j + b) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
     cuts: list[tuple[int, np.ndarray]] = []
     shapes = list(divide(rng, np.array(corners), FIELD_AREA_M2, cuts))
@@ -111,7 +111,7 @@ def _corner(seed: int, i: int, j: int) -> np.ndarray:
     return np.array([i, j]) * CELL_M + rng.uniform(-MAX_CORNER_OFFSET_M, MAX_CORNER_OFFSET_M, 2)
 
 
-def _edge(seed: int, warp: Warp, side: int, i: int, j: int) -> Line:
+def _edge(seed: int, warp: PlanWarp, side: int, i: int, j: int) -> Line:
     """The upper (0) or left (1) edge of a cell, which belongs to that cell."""
     rng = np.random.default_rng([seed, 6, side, i % 2**32, j % 2**32])
     ends = np.array([_corner(seed, i, j), _corner(seed, i + 1 - side, j + side)])
@@ -119,7 +119,7 @@ def _edge(seed: int, warp: Warp, side: int, i: int, j: int) -> Line:
     return Line(warp(densify(ends)), kind, width, _key(rng))
 
 
-def _road(rng: np.random.Generator, warp: Warp, cut: np.ndarray, depth: int) -> Line:
+def _road(rng: np.random.Generator, warp: PlanWarp, cut: np.ndarray, depth: int) -> Line:
     kind, width = ("road", 7.0) if depth < 1 else ("track", 3.5) if depth < 4 else ("border", rng.uniform(1.5, 4.0))
     return Line(warp(densify(cut)), kind, width, _key(rng))
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from terrafix_lab.sim.world.season import SEASONS
-from terrafix_lab.sim.world.shapes import House, Line, Parcel, Warp, densify, divide, long_axis
+from terrafix_lab.sim.world.shapes import House, Line, Parcel, PlanWarp, densify, divide, long_axis
 
 LOT_AREA_M2 = (700.0, 1_300.0)  # a house with its garden
 TREE_SPACING_M = 6.5  # in a wood
@@ -75,7 +75,7 @@ def row_of_trees(rng: np.random.Generator, points: np.ndarray, width_m: float) -
 def village(
     rng: np.random.Generator,
     shape: np.ndarray,
-    warp: Warp,
+    warp: PlanWarp,
     lots: list[Parcel],
     lines: list[Line],
     houses: list[House],

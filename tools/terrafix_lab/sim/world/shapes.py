@@ -38,7 +38,7 @@ class House:
     absent: tuple[str, ...] = ()  # seasons in which it does not exist: built or demolished in between
 
 
-class Warp:
+class PlanWarp:
     """Warps straight plans slightly: plan metres (N, 2) -> plan metres (N, 2)."""
 
     def __init__(self, rng: np.random.Generator) -> None:

@@ -25,10 +25,14 @@ from terrafix_tools.console.compute.observed import FlightObserver, FrameOutcome
 from terrafix_tools.console.compute.packets import Begin
 from terrafix_tools.console.compute.source import Upload, UploadedImages
 from terrafix_tools.console.compute.steering import fix_message, hint_message
+from terrafix_tools.console.events import FinaliseProgress
 from terrafix_tools.console.payloads import Hint, UserFix
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database, open_database
+from terrafix_tools.finalised import read_poses
 from terrafix_tools.replay import replay
+
+PROGRESS_STEPS = 10  # events of a stage of finalise [spec: docs/console.md]
 
 
 class FlightProcess:
@@ -39,6 +43,7 @@ class FlightProcess:
         self._database, self._flight_id, self._report, self._options = database, flight_id, report, options
         self._folder = options.data / "flights" / flight_id
         self._observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image")
+        self._finalised_to, self._progress_events = ("", 0), 0
         with database.read() as db:
             self._known = flights.result_count(db, flight_id)  # frames that an earlier process has stored
         self.source = UploadedImages(
@@ -76,8 +81,32 @@ class FlightProcess:
         return self.source.uploads()
 
     def complete(self) -> None:
+        not_finalised = self._finalise()
         with self._database.write() as db:
-            flights.complete(db, self._flight_id, self._observer.completed())
+            flights.complete(db, self._flight_id, self._observer.completed(not_finalised))
+        self._say("stored")
+
+    def _finalise(self) -> str:
+        """Solves the flight as a whole. -> why that is not possible; else empty."""
+        from terrafix_tools.finalise.run import finalise  # imported by no flight before its end
+
+        out = self._folder / "out"
+        try:
+            finalise(out, self._finalising)
+        except TerrafixError as error:
+            return str(error)
+        self._store("finalised", self._observer.finalised(read_poses(out)))
+        return ""
+
+    def _finalising(self, stage: str, done: int, of: int | None) -> None:
+        """Stores the progress: at the beginning of each stage, and every tenth of it."""
+        tenth = stage, 0 if not of else PROGRESS_STEPS * done // of
+        if tenth == self._finalised_to:
+            return
+        self._finalised_to, self._progress_events = tenth, self._progress_events + 1
+        with self._database.write() as db:
+            progress = FinaliseProgress(stage=stage, done=done, of=of)
+            flights.add_events(db, self._flight_id, f"finalise {self._progress_events}", [progress])
         self._say("stored")
 
     def _say(self, words: str) -> None:

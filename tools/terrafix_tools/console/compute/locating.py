@@ -1,6 +1,6 @@
 """python -m terrafix_tools.console.compute.locating: positions of pixels, from the records of flights.
 
-Reads a question a line from standard input (JSON: Question) and writes the answer as a line (JSON: Answer)."""
+Reads a question a line from standard input (JSON: Question) and writes the answer as a line (JSON: LocateAnswer)."""
 
 import argparse
 import os
@@ -12,7 +12,8 @@ import msgspec
 
 from terrafix.core.errors import TerrafixError
 from terrafix.runtime.fork_server import set_parent_death_signal
-from terrafix_tools.console.locating import Answer, Question
+from terrafix_tools.console.locating import LocateAnswer, Question
+from terrafix_tools.finalised import TABLE
 from terrafix_tools.locate.locator import FlightLocator
 
 NICE = 5  # after the service, before the flights [spec: nice(2)]
@@ -25,25 +26,26 @@ class Locators:
         self._key: object = None
         self._locator: FlightLocator | None = None
 
-    def answer(self, question: Question) -> Answer:
+    def answer(self, question: Question) -> LocateAnswer:
         try:
             locator = self._of(Path(question.out), Path(question.map) if question.map else None)
-            found = locator.locate([(str(question.frame_id), question.pixel)])
+            found = locator.locate([(str(frame_id), pixel) for frame_id, pixel in question.pixels])
         except TerrafixError as error:
-            return Answer(refused=str(error))
+            return LocateAnswer(refused=str(error))
         except OSError as error:
-            return Answer(refused=f"the record of the flight cannot be read ({error.strerror})")
+            return LocateAnswer(refused=f"the record of the flight cannot be read ({error.strerror})")
         lat_deg, lon_deg = locator.flight.frame.to_wgs84(float(found.p_m[0]), float(found.p_m[1]))
-        return Answer(
+        return LocateAnswer(
             lat_deg=lat_deg,
             lon_deg=lon_deg,
             alt_amsl_m=float(found.p_m[2]) if locator.amsl_known else None,
             radius95_m=found.radius95_m,
             surface=str(found.surface),
+            consistent=found.consistent,
         )
 
     def _of(self, out: Path, map_path: Path | None) -> FlightLocator:
-        files = {file.name: file.stat() for file in out.glob("flight*.mcap*")}
+        files = {file.name: file.stat() for file in (*out.glob("flight*.mcap*"), *out.glob(TABLE))}
         key = str(out), tuple((name, found.st_size, found.st_mtime_ns) for name, found in sorted(files.items()))
         if self._locator is None or key != self._key:
             self._locator, self._key = FlightLocator.open(out, map_path), key

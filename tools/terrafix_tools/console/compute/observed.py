@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from terrafix.core.gate import CHI2_95
+from terrafix.core.log_lines import SEARCHING_STEPS
 from terrafix.link.ground_station.prior_request import MIN_FRAMES
 from terrafix.messages import (
     Frame,
@@ -22,22 +23,36 @@ from terrafix.messages import (
     SearchStep,
     Verdict,
 )
+from terrafix_tools.before_after import FINALISED
 from terrafix_tools.console.events import (
     CandidateTile,
     ChunkMerged,
     Event,
     FlightCompleted,
+    FragmentChanged,
     FrameProcessed,
     FrameRefined,
     HintAnswered,
     ProcessingBlocked,
+    RecoveryStarted,
+    RecoverySucceeded,
     SearchExpanded,
     StateChanged,
+    UserFixApplied,
     UserInputNeeded,
     VerdictGiven,
 )
-from terrafix_tools.console.payloads import Ellipse, FlightState, Fragment, FrameResult, Gps, InputRequest
+from terrafix_tools.console.payloads import (
+    Ellipse,
+    FlightState,
+    Fragment,
+    FragmentState,
+    FrameResult,
+    Gps,
+    InputRequest,
+)
 from terrafix_tools.estimates import yaw_deg_of
+from terrafix_tools.finalised import FinalRow
 
 NEAR_M = 20.0  # of the position, within which `confidence` is the probability [spec: AC-1 of the requirements]
 LOST_REASON = "the position is lost and the whole map was searched; a user fix or a hint would help"
@@ -80,6 +95,7 @@ class FlightObserver:
         self._state = FlightState.PROCESSING
         self._asked = False
         self._lost_frames = 0  # in a row
+        self._lost_at = 0  # frame at which the last search began
         self._requests = 0
         self._request: InputRequest | None = None
         self._reached: tuple[str, int | None] | None = None  # of the search
@@ -89,6 +105,9 @@ class FlightObserver:
         self._places: SearchPlaces | None = None  # of the running search
         self._others: list[Event] = []
         self._refined: list[FrameRefined] = []
+        self._scales: dict[int, float] = {}  # by frame: metres per unit, of the newest refinement that states them
+        self._frame_of: dict[str, int] = {}  # by file
+        self._finalised = 0
 
     def resume(self, state: FlightState) -> None:
         """Continues a live flight of which an earlier service has stored this state."""
@@ -103,6 +122,7 @@ class FlightObserver:
                     self.origin_ns = message.t_ns
                 case Frame():
                     self._shown, self._match = message, None
+                    self._frame_of[message.file] = message.frame_id
                 case NavEstimate():
                     self.estimates[message.frame_id] = message
                 case MapMatch():
@@ -110,7 +130,9 @@ class FlightObserver:
                 case SearchPlaces():
                     self._places = message
                 case Refinement():
-                    self._refined += [_refined(pose, str(message.source)) for pose in message.poses]
+                    self._refined += [self._refined_frame(pose, str(message.source)) for pose in message.poses]
+                case MeasurementVerdict(measurement="user_fix", verdict=Verdict.ACCEPTED):
+                    self._others.append(UserFixApplied(frame_id=message.frame_id, detail=message.detail))
                 case MeasurementVerdict() if message.verdict is not Verdict.ACCEPTED or message.measurement == "map":
                     self._others.append(_verdict(message))
                 case HintVerdict():
@@ -127,8 +149,8 @@ class FlightObserver:
         events: list[Event] = [FrameProcessed(**result.model_dump())]
         fragment = None
         if estimate is not None and estimate.fragment_id >= 0:
-            fragment, merged = self._fragment_of(estimate, found)
-            events += [merged] if merged is not None else []
+            fragment, changes = self._fragment_of(estimate, found)
+            events += changes
         events += self._search_events(found, shown.frame_id) if found is not None else []
         self._totals.frames += 1
         if result.ellipse is not None:
@@ -144,7 +166,20 @@ class FlightObserver:
         """What messages without a frame add: those after the source has ended."""
         return self._outcome([])
 
-    def completed(self) -> FlightCompleted:
+    def finalised(self, rows: list[FinalRow]) -> FrameOutcome:
+        """What the solution of the whole flight adds; ``rows``: those with a pose."""
+        poses = [row.pose(self._frame_of[row.file]) for row in rows if row.file in self._frame_of]
+        self._refined += [self._refined_frame(pose, FINALISED) for pose in poses]
+        self._finalised = len(poses)
+        return self._outcome([])
+
+    def _refined_frame(self, pose: RefinedPose, source: str) -> FrameRefined:
+        if pose.m_per_unit is not None:
+            self._scales[pose.frame_id] = pose.m_per_unit
+        return _refined(pose, source, self._scales.get(pose.frame_id))
+
+    def completed(self, not_finalised: str = "") -> FlightCompleted:
+        """``not_finalised``: why the flight has no solution as a whole."""
         totals = self._totals
         median = float(np.median(totals.radii_m)) if totals.radii_m else None
         return FlightCompleted(
@@ -152,10 +187,12 @@ class FlightObserver:
                 "frames": totals.frames,
                 "localised": totals.localised,
                 "refined": len(totals.refined),
+                "finalised": self._finalised,
                 "fragments": len(self._fragments),
                 "merged": totals.merged,
                 "hints": totals.hints,
                 "median_radius95_m": None if median is None else round(median, 2),
+                "not_finalised": not_finalised,
             }
         )
 
@@ -166,35 +203,34 @@ class FlightObserver:
         self._others, self._refined = [], []
         return outcome
 
-    def _fragment_of(self, estimate: NavEstimate, found: MapMatch | None) -> tuple[Fragment, ChunkMerged | None]:
-        """The fragment of the newest frame, and its merge if it is tied to the flight just now."""
-        known = self._fragments.get(estimate.fragment_id)
+    def _fragment_of(self, estimate: NavEstimate, found: MapMatch | None) -> tuple[Fragment, list[Event]]:
+        """The fragment of the newest frame, with its merge, if it is tied to the flight just now, and its new state."""
+        frame_id, known = estimate.frame_id, self._fragments.get(estimate.fragment_id)
         joined = estimate.joined or (found is not None and found.search.step is SearchStep.MERGE)
-        merged = None
         if known is None:
             fragment = Fragment(
-                fragment_id=estimate.fragment_id,
-                first_frame=estimate.frame_id,
-                last_frame=estimate.frame_id,
-                frames=1,
-                joined=joined,
+                fragment_id=estimate.fragment_id, first_frame=frame_id, last_frame=frame_id, frames=1, joined=joined
             )
+            merges = joined and bool(self._fragments)  # the first one of a flight is tied to nothing
         else:
             fragment = known.model_copy(
                 update={
-                    "last_frame": max(known.last_frame, estimate.frame_id),
+                    "last_frame": max(known.last_frame, frame_id),
                     "frames": known.frames + 1,
                     "joined": known.joined or joined,
                 }
             )
-            if joined and not known.joined:
-                fragment.merged_at_frame = estimate.frame_id
-                merged = ChunkMerged(
-                    fragment_id=fragment.fragment_id, frame_id=estimate.frame_id, frames=fragment.frames
-                )
-                self._totals.merged += 1
+            merges = joined and not known.joined
+        events: list[Event] = []
+        if merges:
+            fragment.merged_at_frame = frame_id
+            events.append(ChunkMerged(fragment_id=fragment.fragment_id, frame_id=frame_id, frames=fragment.frames))
+            self._totals.merged += 1
+        fragment.state = _state_of(fragment, found)
+        if known is None or fragment.state is not known.state:
+            events.append(FragmentChanged(fragment_id=fragment.fragment_id, frame_id=frame_id, state=fragment.state))
         self._fragments[fragment.fragment_id] = fragment
-        return fragment, merged
+        return fragment, events
 
     def _search_events(self, found: MapMatch, frame_id: int) -> list[Event]:
         """Changes of the search and of the state of the flight with the match of the newest frame."""
@@ -216,6 +252,11 @@ class FlightObserver:
         lost = FlightState.BLOCKED if self._asked else FlightState.RECOVERING
         state = lost if self._reached is not None else FlightState.PROCESSING
         if state is not self._state:
+            if self._state is FlightState.PROCESSING:
+                self._lost_at = frame_id
+                events.append(RecoveryStarted(frame_id=frame_id))
+            elif state is FlightState.PROCESSING:
+                events.append(RecoverySucceeded(frame_id=frame_id, frames=frame_id - self._lost_at))
             events.append(StateChanged(state=state, previous=self._state))
             self._state = state
         return events
@@ -254,6 +295,16 @@ class FlightObserver:
             distance_m=None if message.distance_m is None else round(message.distance_m, 1),
             text=message.text,
         )
+
+
+def _state_of(fragment: Fragment, found: MapMatch | None) -> FragmentState:
+    """With the map match of its newest frame; a fragment that is merged or anchored stays so."""
+    if fragment.state is FragmentState.MERGED or fragment.merged_at_frame is not None:
+        return FragmentState.MERGED
+    if fragment.state is FragmentState.ANCHORED or (found is not None and found.verdict is Verdict.ACCEPTED):
+        return FragmentState.ANCHORED
+    searched = found is not None and found.search.step in SEARCHING_STEPS
+    return FragmentState.MATCHING if searched else FragmentState.UNANCHORED
 
 
 def ellipse_of(cov_m2: np.ndarray) -> Ellipse:
@@ -295,7 +346,7 @@ def _result(shown: Frame, estimate: NavEstimate | None, found: MapMatch | None, 
     return result
 
 
-def _refined(pose: RefinedPose, source: str) -> FrameRefined:
+def _refined(pose: RefinedPose, source: str, m_per_unit: float | None) -> FrameRefined:
     cov_m2 = np.array([[pose.sigma_e_m**2, pose.cov_en_m2], [pose.cov_en_m2, pose.sigma_n_m**2]])
     return FrameRefined(
         frame_id=pose.frame_id,
@@ -304,7 +355,15 @@ def _refined(pose: RefinedPose, source: str) -> FrameRefined:
         ellipse=ellipse_of(cov_m2),
         source=source,
         fragment_id=pose.fragment_id,
+        orientation=_rounded(pose.q_w_c),
+        covariance=_rounded(pose.cov),
+        m_per_unit=None if m_per_unit is None else round(m_per_unit, 4),
     )
+
+
+def _rounded(values: tuple[float, ...] | None) -> list[float] | None:
+    """To six significant digits."""
+    return None if values is None else [float(f"{value:.6g}") for value in values]
 
 
 def _tiles(found: SearchPlaces) -> list[CandidateTile]:

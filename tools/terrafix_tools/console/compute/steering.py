@@ -5,14 +5,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from terrafix.core.camera import CameraCalibration, Mount
+from terrafix.core.camera import CameraCalibration, camera_rotation
 from terrafix.core.gate import SIGMAS_95
-from terrafix.core.geodesy import LocalFrame, rot_from_quat
+from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, NavEstimate, PositionHint
 from terrafix_tools.console.payloads import Hint, UserFix
 
 SOURCE = "console"
-FIX_SIGMA_M = 5.0  # of the place of a user fix, per axis [spec: RS-11 of the service contract]
 # 1-sigma of a distance by odometry alone, as a share of it [spec: docs/records.md, error of the scale]
 ODOMETRY_SHARE = 0.1
 MIN_DESCENT = 0.1  # least downward component of the unit ray of a user fix: 6 degrees [spec: no ground above]
@@ -35,7 +34,7 @@ def fix_message(
     if seen is None:
         return None
     frame = LocalFrame(fix.lat, fix.lon)
-    r_w_c = rot_from_quat(seen.q_w_b) @ Mount.of(camera).r_b_c()
+    r_w_c = camera_rotation(seen, camera)
     x, y = CameraCalibration.of(camera).normalise(np.array([pixel]))[0]
     ray = r_w_c @ np.array([x, y, 1.0])
     ray /= np.linalg.norm(ray)
@@ -44,16 +43,24 @@ def fix_message(
     offset_m = -seen.agl_m / ray[2] * ray[:2]  # from the vehicle to the place
     tilt_sigma, yaw_sigma = _rotation_sigmas(seen)
     away_m = float(np.hypot(*offset_m))
-    variance_m2 = FIX_SIGMA_M**2 + (seen.agl_m * tilt_sigma / ray[2] ** 2) ** 2 + (away_m * yaw_sigma) ** 2
-    at_m, t_ns = -offset_m, seen.t_ns
+    variance_m2 = fix.sigma_m**2 + (seen.agl_m * tilt_sigma / ray[2] ** 2) ** 2 + (away_m * yaw_sigma) ** 2
+    at_m, t_ns, frame_id = -offset_m, seen.t_ns, seen.frame_id
     newest = max(estimates.values(), key=lambda estimate: estimate.frame_id)
     if newest.fragment_id == seen.fragment_id >= 0:
         before, now = (np.array(frame.to_local(e.lat_deg, e.lon_deg)) for e in (seen, newest))
-        at_m, t_ns = at_m + now - before, now_ns
+        at_m, t_ns, frame_id = at_m + now - before, now_ns, newest.frame_id
         variance_m2 += (ODOMETRY_SHARE * float(np.hypot(*(now - before)))) ** 2
     lat_deg, lon_deg = frame.to_wgs84(*at_m)
     radius_m = SIGMAS_95 * math.sqrt(variance_m2)
-    return PositionHint(t_ns=t_ns, lat_deg=lat_deg, lon_deg=lon_deg, radius_m=radius_m, source=SOURCE)
+    return PositionHint(
+        t_ns=t_ns,
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        radius_m=radius_m,
+        source=SOURCE,
+        frame_id=frame_id,
+        sigma_m=math.sqrt(variance_m2),
+    )
 
 
 def _rotation_sigmas(estimate: NavEstimate) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from terrafix.core.errors import OutputError
 from terrafix_tools.console.store import schema
 
 FILE = "console.sqlite"
+EARLIER = (0, 1)  # versions of tables that are brought up to date; 0: none, or of the time before versions
 BUSY_MS = 10_000  # time-out of a write that waits for that of another process
 
 
@@ -68,15 +69,18 @@ def open_database(folder: Path, *, durable: bool = True) -> Database:
     try:
         with engine.connect() as connection:
             version = connection.exec_driver_sql("PRAGMA user_version").scalar()
-            if version == 0:
+            if version in EARLIER:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")  # another process may open it now
                 schema.metadata.create_all(connection)  # tables that are there already stay as they are
+                columns = [column["name"] for column in sa.inspect(connection).get_columns("fragments")]
+                if "state" not in columns:
+                    connection.exec_driver_sql(schema.SINCE_1)
                 connection.exec_driver_sql(f"PRAGMA user_version = {schema.VERSION}")
                 connection.exec_driver_sql("COMMIT")
     except (sa.exc.DatabaseError, sqlite3.DatabaseError) as error:
         engine.dispose()
         raise OutputError(f"{file}: cannot be opened ({error.args[0]}); name another folder with --data") from None
-    if version not in (0, schema.VERSION):
+    if version not in (*EARLIER, schema.VERSION):
         engine.dispose()
         raise OutputError(
             f"{file}: has tables of version {version}, this Terrafix knows {schema.VERSION}; "

@@ -15,7 +15,6 @@ from terrafix_tools.console.compute.observed import FrameOutcome
 from terrafix_tools.console.events import Event, FlightCompleted, StateChanged, name_of
 from terrafix_tools.console.payloads import (
     Accepted,
-    Area,
     Flight,
     FlightKind,
     FlightMap,
@@ -27,12 +26,14 @@ from terrafix_tools.console.payloads import (
     InputRequest,
     MapState,
     NewFlight,
+    RouteArea,
     UserFix,
 )
 from terrafix_tools.console.problems import Refusal
 from terrafix_tools.console.store.schema import events, flights, fragments, headings, hints, images, results
 
 EVENT_PAGE = 500  # events that are read at once [spec: about 200 kB]
+REFINED_KEYS = ("gps", "altitude", "ellipse", "orientation", "covariance", "m_per_unit")  # of a result
 _NUMBER = re.compile(r"(\d{1,12})\D*$")
 
 
@@ -117,7 +118,7 @@ def complete(db: sa.Connection, flight_id: str, completed: FlightCompleted) -> N
     update(db, flight_id, state=FlightState.COMPLETED.value, request=None)
 
 
-def maps_to_make(db: sa.Connection) -> list[tuple[str, Area]]:
+def maps_to_make(db: sa.Connection) -> list[tuple[str, RouteArea]]:
     """The flights whose maps are not made yet."""
     rows = db.execute(sa.select(flights.c.id, flights.c.spec).where(flights.c.map_state == MapState.PREPARING.value))
     specs = [(row.id, NewFlight.model_validate_json(row.spec).area) for row in rows]
@@ -271,8 +272,9 @@ def results_of(db: sa.Connection, flight_id: str, *, refined: bool, first: int, 
         result = FrameResult.model_validate_json(row.immediate)
         if refined and row.refined is not None:
             newer = json.loads(row.refined)
-            changed = {key: newer[key] for key in ("gps", "altitude", "ellipse")}
-            result = FrameResult.model_validate({**result.model_dump(), **changed, "refined": True})
+            changed = {key: newer[key] for key in REFINED_KEYS if key in newer}  # one of an earlier version has fewer
+            changed |= {"refined": True, "refined_by": newer["source"]}
+            result = FrameResult.model_validate({**result.model_dump(), **changed})
         found.append(result)
     return found
 

@@ -2,7 +2,8 @@
 
 import sqlalchemy as sa
 
-VERSION = 1  # of these tables, in user_version of the file
+VERSION = 2  # of these tables, in user_version of the file
+SINCE_1 = "ALTER TABLE fragments ADD COLUMN state TEXT NOT NULL DEFAULT 'unanchored'"  # version 1 had none
 
 metadata = sa.MetaData()
 
@@ -68,6 +69,7 @@ fragments = sa.Table(
     sa.Column("frames", sa.Integer, nullable=False),
     sa.Column("joined", sa.Boolean, nullable=False),
     sa.Column("merged_at_frame", sa.Integer),
+    sa.Column("state", sa.Text, nullable=False, server_default="unanchored"),  # FragmentState
 )
 hints = sa.Table(
     "hints",

@@ -6,7 +6,7 @@ from terrafix.core.errors import UsageError
 from terrafix_tools.mapping.area.polygons import Area
 
 POLAR_DEG = 84.0  # limit of Web Mercator and UTM; a compass is inaccurate beyond
-LARGEST_KM2 = 10_000.0
+LARGEST_KM2 = 20_000.0  # 20 km around a route of 300 km is 13,373 km2 [spec: RS-2 of the requirements]
 MIN_DISTANCE_DEG = 1e-7  # about a centimetre: nearer points are duplicates
 MAX_RING_POINTS = 20_000  # a polygon with more points is a coastline, not an area of operation
 

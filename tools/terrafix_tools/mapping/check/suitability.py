@@ -19,6 +19,7 @@ from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.map.format import Ce90Origin, Layer, accuracy_of
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix.vision.sources.description import camera_of, read_description
+from terrafix.vision.sources.fisheye import view_of
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.check.mission import (
@@ -181,7 +182,7 @@ def _camera(path: Path | None) -> tuple[CameraCalibration, str]:
     if path is None:
         return DEFAULT_CAMERA, "1280 x 720 px, 70 degrees wide (assumed; give --camera)"
     read = read_description(path)
-    return CameraCalibration.of(camera_of(path, read)), read.name or path.name
+    return CameraCalibration.of(view_of(camera_of(path, read))), read.name or path.name
 
 
 def _age_years(date: str) -> float | None:

@@ -19,8 +19,8 @@ SAMPLES = 12  # tiles that are fetched to measure their size; they are part of t
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """Estimate of one source. ``fetch_bytes`` and ``seconds``: of the remaining download."""
+class FetchEstimate:
+    """Of one source. ``fetch_bytes`` and ``seconds``: of the remaining download."""
 
     title: str
     items: int  # total number of tiles or images
@@ -38,7 +38,7 @@ def spread_sample(missing: TileRange, count: int = SAMPLES) -> TileRange:
     return TileRange(missing.zoom, missing.column, missing.row, touched)
 
 
-def check_room(estimates: Sequence[Estimate], cache: Path, package_bytes: float, out: Path) -> None:
+def check_room(estimates: Sequence[FetchEstimate], cache: Path, package_bytes: float, out: Path) -> None:
     """Raises OutputError when the downloads do not fit beside the cache, or the package beside ``out``."""
     fetch_bytes = sum(e.fetch_bytes for e in estimates) * STORE_OVERHEAD
     needs = {_nearest_existing(cache): fetch_bytes}
@@ -56,7 +56,7 @@ def check_room(estimates: Sequence[Estimate], cache: Path, package_bytes: float,
             )
 
 
-def check_consent(estimates: Sequence[Estimate], agreed: bool) -> None:
+def check_consent(estimates: Sequence[FetchEstimate], agreed: bool) -> None:
     """Raises UsageError when the downloads are large and not confirmed."""
     fetch_bytes, seconds = sum(e.fetch_bytes for e in estimates), sum(e.seconds for e in estimates)
     if (fetch_bytes > LARGE_BYTES or seconds > LARGE_S) and not agreed:
@@ -66,7 +66,7 @@ def check_consent(estimates: Sequence[Estimate], agreed: bool) -> None:
         )
 
 
-def describe(e: Estimate) -> str:
+def describe(e: FetchEstimate) -> str:
     """One-line description."""
     existing = f"{e.title}: {e.items - e.missing} of {e.items} there"
     if not e.missing:

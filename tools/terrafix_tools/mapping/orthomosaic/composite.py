@@ -19,7 +19,7 @@ MAX_PIXELS = 400_000_000
 
 
 @dataclass(frozen=True)
-class Grid:
+class OrthomosaicGrid:
     """North-up raster in ``crs``: pixel (row, column) covers [x_min + column px, y_max - row px)."""
 
     crs: CRS
@@ -30,7 +30,7 @@ class Grid:
     height_px: int
 
 
-def grid_around(views: list[CameraView], frame: LocalFrame, crs: CRS, gsd_m: float | None) -> Grid:
+def grid_around(views: list[CameraView], frame: LocalFrame, crs: CRS, gsd_m: float | None) -> OrthomosaicGrid:
     """Raster of the ground that ``views`` see. ``gsd_m``: None: the median ground pixel of the frames.
 
     Raises UsageError: too many pixels."""
@@ -43,7 +43,7 @@ def grid_around(views: list[CameraView], frame: LocalFrame, crs: CRS, gsd_m: flo
             f"{width_px} x {height_px} pixels of {size_m:.2f} m are too many; give a coarser --gsd, for example "
             f"{size_m * np.sqrt(width_px * height_px / MAX_PIXELS):.2f}"
         )
-    return Grid(crs, float(np.min(x)), float(np.max(y)), size_m, width_px, height_px)
+    return OrthomosaicGrid(crs, float(np.min(x)), float(np.max(y)), size_m, width_px, height_px)
 
 
 def is_steep(ray: np.ndarray) -> bool:
@@ -65,7 +65,7 @@ class Composite:
     """``image`` (H, W, 3) uint8 BGR; ``steepness`` (H, W) float32: squared tangent off the vertical of the frame that a
     pixel is of, inf: none; ``frame_of`` (H, W) int32: its frame id, -1: none."""
 
-    def __init__(self, grid: Grid, frame: LocalFrame, elevation: Elevation | None) -> None:
+    def __init__(self, grid: OrthomosaicGrid, frame: LocalFrame, elevation: Elevation | None) -> None:
         shape = grid.height_px, grid.width_px
         self.grid = grid
         self.image = np.zeros((*shape, 3), np.uint8)

@@ -1,45 +1,19 @@
 """Cameras and images of a recorded flight for an orthomosaic."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from terrafix.core.errors import SourceError
-from terrafix.core.geodesy import rot_from_quat
-from terrafix.estimator.state import HORIZONTAL, WORLD_ROTATION
-from terrafix.messages import Refinement
-from terrafix.recorder.reader import read_flight, read_frame_images
+from terrafix.estimator.state import HORIZONTAL
+from terrafix.recorder.reader import read_frame_images
 from terrafix.vision.sources import open_source
 from terrafix_tools.evaluate import read_summary
-from terrafix_tools.locate.locator import FlightLocator
 from terrafix_tools.locate.views import CameraView
 
 MIN_STEP_SHARE = 0.15  # of the height, between two frames that are used: nearer ones show the same ground again
-
-
-def refined_views(locator: FlightLocator, record: Path) -> dict[int, CameraView]:
-    """Cameras by frame id, at the newest poses that were refined after later map matches, with their variances, where
-    there are some."""
-    views = dict(locator.flight.views)
-    for _, _, message in read_flight(record):
-        if not isinstance(message, Refinement):
-            continue
-        for pose in message.poses:
-            view = views.get(pose.frame_id)
-            if view is None:
-                continue
-            p_m, r_w_c, cov = view.p_c_in_w_m.copy(), view.r_w_c, view.cov.copy()
-            p_m[HORIZONTAL] = locator.flight.frame.to_local(pose.lat_deg, pose.lon_deg)
-            refined = np.sqrt(np.diag(cov))
-            refined[HORIZONTAL] = pose.sigma_e_m, pose.sigma_n_m
-            if pose.q_w_c is not None and pose.rotation_sigma_rad is not None:
-                r_w_c, refined[WORLD_ROTATION] = rot_from_quat(pose.q_w_c), pose.rotation_sigma_rad
-            shrink = np.minimum(1.0, refined / np.sqrt(np.diag(cov)))
-            views[pose.frame_id] = replace(view, p_c_in_w_m=p_m, r_w_c=r_w_c, cov=cov * np.outer(shrink, shrink))
-    return views
 
 
 def spread(views: dict[int, CameraView], max_sigma_m: float) -> list[CameraView]:

@@ -17,7 +17,7 @@ from terrafix_tools.locate.views import CameraView
 from terrafix_tools.log.contents import read_contents
 from terrafix_tools.mapping.build_checks import check_date
 from terrafix_tools.mapping.orthomosaic.composite import Composite, grid_around, is_steep
-from terrafix_tools.mapping.orthomosaic.frames import images, refined_views, spread
+from terrafix_tools.mapping.orthomosaic.frames import images, spread
 from terrafix_tools.mapping.orthomosaic.write import Statement, write_cog
 from terrafix_tools.mapping.sources.utm import utm_epsg
 from terrafix_tools.progress import progress_bar
@@ -27,7 +27,7 @@ MAX_SIGMA_M = 10.0  # default of the largest stated 1-sigma of a frame that is u
 
 
 @dataclass(frozen=True)
-class Request:
+class OrthomosaicRequest:
     """The options of the command."""
 
     record: Path
@@ -50,7 +50,7 @@ class Made:
     statement: Statement
 
 
-def make(wanted: Request, *, progress: bool = False) -> Made:
+def make(wanted: OrthomosaicRequest, *, progress: bool = False) -> Made:
     """Raises SourceError, MapError, UsageError, OutputError."""
     if wanted.out.suffix.lower() not in (".tif", ".tiff"):
         raise UsageError(f"{wanted.out}: a GeoTIFF ends in .tif; choose another name")
@@ -58,7 +58,7 @@ def make(wanted: Request, *, progress: bool = False) -> Made:
         raise OutputError(f"{wanted.out.parent}: no such folder; make it, or choose another file")
     check_date(wanted.date)
     locator = FlightLocator.open(wanted.record, wanted.map_path)
-    views = spread(refined_views(locator, wanted.record), wanted.max_sigma_m)
+    views = spread(locator.flight.views, wanted.max_sigma_m)
     if not views:
         raise SourceError(
             f"{wanted.record}: no frame has a position that is known to {wanted.max_sigma_m:g} m; give a larger --sigma"

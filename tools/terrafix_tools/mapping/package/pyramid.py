@@ -29,7 +29,7 @@ Place = tuple[int, int]  # column, row of a chunk at the zoom of chunks
 
 
 @dataclass(frozen=True)
-class Chunk:
+class TileTree:
     """All tiles under one tile, children first, and that tile's own pixels (256, 256, 4); None = no imagery."""
 
     tiles: list[tuple[int, int, int, bytes]]  # zoom, column, row, data
@@ -45,12 +45,12 @@ class ChunkRenderer:
     finest: int  # zoom
     lossless: bool = False
 
-    def render(self, place: Place) -> Chunk:
+    def render(self, place: Place) -> TileTree:
         depth = min(CHUNK_LEVELS, self.finest)
         tiles: list[tuple[int, int, int, bytes]] = []
         pixels = self._read(place[0], place[1], TILE_PX << depth)
         mask = cv2.extractChannel(pixels, 3)
-        return Chunk(tiles, self._reduce(self.finest - depth, place[0], place[1], pixels, mask, tiles))
+        return TileTree(tiles, self._reduce(self.finest - depth, place[0], place[1], pixels, mask, tiles))
 
     def _reduce(
         self,
@@ -152,7 +152,7 @@ class Pyramid:
                 visit(0, column, row)
         return found
 
-    def write(self, chunks: Iterator[Chunk]) -> bool:
+    def write(self, chunks: Iterator[TileTree]) -> bool:
         """True when any pixel was valid."""
         tops = [
             self._tile(0, column, row, chunks)
@@ -161,7 +161,7 @@ class Pyramid:
         ]
         return any(top is not None for top in tops)
 
-    def _tile(self, zoom: int, column: int, row: int, chunks: Iterator[Chunk]) -> np.ndarray | None:
+    def _tile(self, zoom: int, column: int, row: int, chunks: Iterator[TileTree]) -> np.ndarray | None:
         if not self._exists(zoom, column, row):
             return None
         if zoom == self._chunk_zoom:

@@ -10,7 +10,13 @@ from typing import Protocol
 from rich.console import Console
 
 from terrafix_tools.mapping.area.polygons import Area
-from terrafix_tools.mapping.fetching.plan import PACKAGE_BYTES_PER_PX, Estimate, check_consent, check_room, describe
+from terrafix_tools.mapping.fetching.plan import (
+    PACKAGE_BYTES_PER_PX,
+    FetchEstimate,
+    check_consent,
+    check_room,
+    describe,
+)
 from terrafix_tools.mapping.fetching.progress import OnProgress, shown, steps_display
 from terrafix_tools.mapping.layers import LayerInput
 from terrafix_tools.mapping.mosaic.compositing import Mosaic, MosaicPlan, Opener
@@ -41,7 +47,7 @@ class Job(Protocol):
     def date(self) -> str: ...
     @property
     def licence(self) -> str: ...
-    def estimate(self) -> Estimate: ...
+    def estimate(self) -> FetchEstimate: ...
     def fetch(self, on_progress: OnProgress) -> None: ...
     def openers(self) -> list[Opener]: ...
 
@@ -59,7 +65,7 @@ class Preparation:
             elif spec.from_network:
                 self._jobs[i] = TileJob(spec, request.area, request.gsd_m, request.cache)
 
-    def estimate(self) -> list[Estimate]:
+    def estimate(self) -> list[FetchEstimate]:
         """Prints and returns the remaining download of each source. Raises as the jobs do.
 
         The gaps of a better network source are unknown until it is downloaded."""
@@ -71,7 +77,7 @@ class Preparation:
             self._say.print(describe(made[-1]), highlight=False)
         return made
 
-    def fetch(self, estimates: Sequence[Estimate], *, agreed: bool) -> None:
+    def fetch(self, estimates: Sequence[FetchEstimate], *, agreed: bool) -> None:
         """Raises UsageError when the download is large and not confirmed, OutputError when it does not fit."""
         check_consent(estimates, agreed)
         check_room(estimates, self._request.cache, 0.0, self._request.out)

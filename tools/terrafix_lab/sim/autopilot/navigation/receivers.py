@@ -4,7 +4,7 @@ from typing import Any
 
 from terrafix_lab.sim.autopilot.navigation.gps import TYPE_MAV, TYPE_NONE, Fix, GpsInputDriver, GpsInstance, Receiver
 from terrafix_lab.sim.autopilot.navigation.status import INFO, NOTICE, StatusMessage
-from terrafix_lab.sim.autopilot.navigation.switch import Switch
+from terrafix_lab.sim.autopilot.navigation.switch import ReceiverSwitch
 from terrafix_lab.sim.interfaces import GnssFix
 
 InstanceFix = tuple[GpsInstance, Fix | None]  # instance and its fix; None: below 3D
@@ -16,7 +16,7 @@ class Receivers:
     def __init__(self, parameters: dict[str, float]) -> None:
         """``parameters`` are read at every step, since they may change in flight."""
         self._parameters = parameters
-        self._switch = Switch()
+        self._switch = ReceiverSwitch()
         self.gps: list[GpsInstance | None] = [self._create(0), self._create(1)]
 
     @property

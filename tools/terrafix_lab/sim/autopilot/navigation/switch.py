@@ -12,7 +12,7 @@ ONE_SATELLITE_S = 20.0  # one more satellite must persist this long to be prefer
 TWO_SATELLITES_S = 5.0  # two more this long
 
 
-class Switch:
+class ReceiverSwitch:
     """Call ``choose`` at every step; ``chosen`` is an index into the instances."""
 
     def __init__(self) -> None:

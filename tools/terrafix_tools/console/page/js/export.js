@@ -3,9 +3,13 @@
 import {ellipseRing} from "./geo.js";
 
 const COLUMNS = ["frame_id", "file", "t_s", "lat", "lon", "altitude", "agl_m", "heading", "confidence", "semi_major_m", "semi_minor_m",
-  "bearing_deg", "source", "match", "inliers", "search", "fragment_id", "joined", "refined", "error"];
+  "bearing_deg", "source", "match", "inliers", "search", "fragment_id", "joined", "refined",
+  "refined_by", "qw", "qx", "qy", "qz", "covariance", "m_per_unit", "error"];
 
-const flat = (result) => ({...result, ...result.gps, ...result.ellipse});
+const flat = (result) => {
+  const [qw, qx, qy, qz] = result.orientation ?? [];
+  return {...result, ...result.gps, ...result.ellipse, qw, qx, qy, qz, covariance: result.covariance?.join(" ")};
+};
 const cell = (value) => {
   const text = value === null || value === undefined ? "" : String(value);
   return /[",\n]/.test(text) ? `"${text.replaceAll("\"", "\"\"")}"` : text;

@@ -57,8 +57,8 @@ export class FlightModel {
       case "frame_refined": {
         const before = this.results.get(data.frame_id);
         if (before) {
-          const {gps, altitude, ellipse} = data;
-          this.take({...before, gps, altitude, ellipse, refined: true});
+          const {gps, altitude, ellipse, orientation, covariance, m_per_unit, source} = data;
+          this.take({...before, gps, altitude, ellipse, orientation, covariance, m_per_unit, refined: true, refined_by: source});
         }
         return false;
       }

@@ -138,6 +138,7 @@ const LINES = {
   chunk_merged: (d) => t("ev_merged", number(d.fragment_id), number(d.frames), number(d.frame_id)),
   state_changed: (d) => t("ev_state", t(`state_${d.previous}`), t(`state_${d.state}`)),
   hint_answered: (d) => t("ev_hint", d.verdict, d.text),
+  finalise_progress: (d) => t("ev_finalise", d.stage, d.of === null ? d.done : t("of", d.done, d.of)),
   flight_completed: () => t("ev_completed"),
 };
 

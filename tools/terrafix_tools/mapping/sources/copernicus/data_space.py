@@ -32,7 +32,7 @@ MAX_SCENES = 500
 
 
 @dataclass(frozen=True)
-class Service:
+class DataSpaceService:
     """URLs of the public service; others for a mirror."""
 
     token_url: str = "https://identity.dataspace.copernicus.eu/auth/realms/CDSE/protocol/openid-connect/token"
@@ -69,7 +69,7 @@ def read_credentials(file: Path = CREDENTIALS_FILE) -> Credentials:
 class Copernicus:
     """Client of the service. Thread-safe."""
 
-    def __init__(self, credentials: Credentials, service: Service, limits: Limits = LIMITS) -> None:
+    def __init__(self, credentials: Credentials, service: DataSpaceService, limits: Limits = LIMITS) -> None:
         self._credentials, self._service = credentials, service
         self.client = Client("Copernicus Data Space", limits)
         self._lock = threading.Lock()

@@ -9,7 +9,12 @@ from terrafix.core.errors import OutputError
 from terrafix_tools.mapping.area.polygons import Area
 from terrafix_tools.mapping.fetching.progress import OnProgress
 from terrafix_tools.mapping.sources.copernicus.chunks import ChunkRaster, fetch_chunks, process_request
-from terrafix_tools.mapping.sources.copernicus.data_space import MAX_REQUEST_PX, Copernicus, Service, read_credentials
+from terrafix_tools.mapping.sources.copernicus.data_space import (
+    MAX_REQUEST_PX,
+    Copernicus,
+    DataSpaceService,
+    read_credentials,
+)
 from terrafix_tools.mapping.sources.utm import utm_epsg
 
 NAME = "glo-30"
@@ -26,7 +31,7 @@ function evaluatePixel(sample) {
 DATA = {"type": "dem", "dataFilter": {"demInstance": "COPERNICUS_30"}, "processing": {"upsampling": "BILINEAR"}}
 
 
-def fetch_glo30(area: Area, cache: Path, on_progress: OnProgress, service: Service | None = None) -> Path:
+def fetch_glo30(area: Area, cache: Path, on_progress: OnProgress, service: DataSpaceService | None = None) -> Path:
     """Fetches elevation; returns a GDAL VRT of the chunks that the area touches.
 
     Raises UsageError (no credentials), FetchError, RefusedError, OutputError."""
@@ -35,7 +40,7 @@ def fetch_glo30(area: Area, cache: Path, on_progress: OnProgress, service: Servi
     paths = {cache / NAME / f"{raster.epsg}-{c.column}-{c.row}.tif": c for c in raster.touched(area)}
     wanted = {p: (c, process_request(raster, c, DATA, EVALSCRIPT)) for p, c in paths.items() if not p.is_file()}
     if wanted:
-        fetch_chunks(Copernicus(read_credentials(), service or Service()), raster, wanted, on_progress)
+        fetch_chunks(Copernicus(read_credentials(), service or DataSpaceService()), raster, wanted, on_progress)
     return _vrt(raster, list(paths))
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping.area.polygons import Area
-from terrafix_tools.mapping.fetching.plan import Estimate
+from terrafix_tools.mapping.fetching.plan import FetchEstimate
 from terrafix_tools.mapping.fetching.progress import OnProgress
 from terrafix_tools.mapping.mosaic.compositing import Opener
 from terrafix_tools.mapping.source import ImagerySource
 from terrafix_tools.mapping.sources.copernicus.chunks import Chunk, ChunkRaster, fetch_chunks, process_request
-from terrafix_tools.mapping.sources.copernicus.data_space import LICENCE, Copernicus, Service, read_credentials
+from terrafix_tools.mapping.sources.copernicus.data_space import LICENCE, Copernicus, DataSpaceService, read_credentials
 from terrafix_tools.mapping.sources.spec import SourceSpec
 from terrafix_tools.mapping.sources.utm import utm_epsg
 
@@ -44,9 +44,9 @@ function evaluatePixel(samples) {
 class SentinelJob:
     """One source with service = "sentinel-2", for one area."""
 
-    def __init__(self, spec: SourceSpec, area: Area, cache: Path, service: Service | None = None) -> None:
+    def __init__(self, spec: SourceSpec, area: Area, cache: Path, service: DataSpaceService | None = None) -> None:
         self.spec, self._area = spec, area
-        self._copernicus = Copernicus(read_credentials(), service or Service())
+        self._copernicus = Copernicus(read_credentials(), service or DataSpaceService())
         last = datetime.date.fromisoformat(spec.date) if spec.date else datetime.datetime.now(datetime.UTC).date()
         self._period = ((last - datetime.timedelta(days=spec.days)).isoformat(), last.isoformat())
         west, south, east, north = area.bounds_deg
@@ -64,7 +64,7 @@ class SentinelJob:
     def licence(self) -> str:
         return self.spec.licence or f"{LICENCE} {self._period[1][:4]}"
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> FetchEstimate:
         """Raises MapError when there is no scene, FetchError, RefusedError (credentials)."""
         missing = self._missing()
         if missing:
@@ -76,7 +76,7 @@ class SentinelJob:
                 )
         connections = self._copernicus.client.limits.connections
         seconds = len(missing) * CHUNK_S / connections
-        return Estimate(self.spec.title, len(self._chunks), len(missing), len(missing) * CHUNK_BYTES, seconds)
+        return FetchEstimate(self.spec.title, len(self._chunks), len(missing), len(missing) * CHUNK_BYTES, seconds)
 
     def fetch(self, on_progress: OnProgress) -> None:
         """Raises FetchError, RefusedError, OutputError."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping.area.polygons import Area, Placed
 from terrafix_tools.mapping.fetching.fetch import Client
-from terrafix_tools.mapping.fetching.plan import Estimate, spread_sample
+from terrafix_tools.mapping.fetching.plan import FetchEstimate, spread_sample
 from terrafix_tools.mapping.fetching.progress import OnProgress
 from terrafix_tools.mapping.fetching.tiles import TileDownload
 from terrafix_tools.mapping.mosaic.compositing import Opener
@@ -47,12 +47,12 @@ class TileJob:
         """Drops the tiles that better sources cover completely."""
         self.tiles = uncovered(self._area, better, self.tiles)
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> FetchEstimate:
         """Fetches a few tiles to measure their size. Raises as `TileDownload.run`, and MapError."""
         with self._store() as store:
             missing = store.missing(self.tiles)
             if not missing.count:
-                return Estimate(self.spec.title, self.tiles.count, 0, 0.0, 0.0)
+                return FetchEstimate(self.spec.title, self.tiles.count, 0, 0.0, 0.0)
             began_s = time.monotonic()
             sample = spread_sample(missing)
             download = self._download(store)
@@ -60,7 +60,7 @@ class TileJob:
         done = download.progressed
         rate = min(done.done / max(time.monotonic() - began_s, 1e-3), self.spec.requests_per_s)
         left = missing.count - sample.count
-        return Estimate(self.spec.title, self.tiles.count, left, left * done.size_bytes / done.done, left / rate)
+        return FetchEstimate(self.spec.title, self.tiles.count, left, left * done.size_bytes / done.done, left / rate)
 
     def fetch(self, on_progress: OnProgress) -> None:
         """Raises as `TileDownload.run`, and MapError when the server has no tile in the area."""

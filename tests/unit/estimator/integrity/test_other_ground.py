@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from terrafix.core.agreement import Agreement, Cause
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.estimator.integrity.innovation import Innovation
-from terrafix.estimator.integrity.map_consistency import MapConsistency
+from terrafix.estimator.integrity.other_ground import OtherGround
 
 OFFSET_M = np.array([90.0, -120.0])  # 150 m
 NEAR_M = np.array([2.0, -1.0])
@@ -16,86 +17,90 @@ def innovation(offset_m: np.ndarray, covariance_m2: np.ndarray) -> Innovation:
     return Innovation(offset_m, covariance_m2, GATE[2])
 
 
-def after_rejected(consistency: MapConsistency, times: int) -> MapConsistency:
+def probability(ground: OtherGround) -> float:
+    return ground.agreement.probability(Cause.OTHER_GROUND)
+
+
+def after_rejected(consistency: OtherGround, times: int) -> OtherGround:
     for _ in range(times):
-        consistency.add_rejected(OFFSET_M)
+        consistency.on_rejected(OFFSET_M)
     return consistency
 
 
 @pytest.mark.parametrize("times", [0, 1])
 def test_a_single_rejected_pose_does_not_inflate_the_covariance(times: int) -> None:
-    assert after_rejected(MapConsistency(), times).variance_m2 == 0.0
+    assert after_rejected(OtherGround(Agreement()), times).variance_m2 == 0.0
 
 
 def test_rejected_poses_without_accepted_ones_inflate_the_covariance_to_their_distance() -> None:
-    few, many = (after_rejected(MapConsistency(), times) for times in (2, 6))
-    assert MIN_COMPONENT_WEIGHT < few.probability < 0.5
-    assert few.variance_m2 == pytest.approx(few.probability * 150.0**2)
-    assert many.probability > 0.9 and many.variance_m2 == pytest.approx(150.0**2, rel=0.1)
+    few, many = (after_rejected(OtherGround(Agreement()), times) for times in (2, 6))
+    assert MIN_COMPONENT_WEIGHT < probability(few) < 0.5
+    assert few.variance_m2 == pytest.approx(probability(few) * 150.0**2)
+    assert probability(many) > 0.9 and many.variance_m2 == pytest.approx(150.0**2, rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_map_with_a_tenth_of_wrong_poses_is_not_taken_for_another_place(seed: int) -> None:
-    rng, consistency = np.random.default_rng(seed), MapConsistency()
+    rng, consistency = np.random.default_rng(seed), OtherGround(Agreement())
     inflated = 0
     for _ in range(500):
         if rng.uniform() < 0.1:
-            consistency.add_rejected(OFFSET_M)
+            consistency.on_rejected(OFFSET_M)
         else:
-            consistency.add_accepted(0.5, innovation(NEAR_M, NARROW_M2))
+            consistency.on_pose(0.5, innovation(NEAR_M, NARROW_M2))
         inflated += consistency.variance_m2 > 0.0
     assert inflated < 0.1 * 500
 
 
 def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
-    hovering, flying = (after_rejected(MapConsistency(), 4) for _ in range(2))
+    hovering, flying = (after_rejected(OtherGround(Agreement()), 4) for _ in range(2))
     for _ in range(10):
-        hovering.add_accepted(0.0, innovation(NEAR_M, NARROW_M2))
-        flying.add_accepted(0.5, innovation(NEAR_M, NARROW_M2))
-    assert hovering.probability == after_rejected(MapConsistency(), 4).probability
+        hovering.on_pose(0.0, innovation(NEAR_M, NARROW_M2))
+        flying.on_pose(0.5, innovation(NEAR_M, NARROW_M2))
+    assert probability(hovering) == probability(after_rejected(OtherGround(Agreement()), 4))
     assert flying.variance_m2 == 0.0
 
 
 def test_the_distance_of_earlier_rejected_poses_is_forgotten_after_accepted_ones() -> None:
-    consistency = after_rejected(MapConsistency(), 1)
+    consistency = after_rejected(OtherGround(Agreement()), 1)
     for _ in range(20):
-        consistency.add_accepted(1.0, innovation(NEAR_M, NARROW_M2))
+        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2))
     for _ in range(4):
-        consistency.add_rejected(0.1 * OFFSET_M)
-    assert consistency.variance_m2 == pytest.approx(consistency.probability * 15.0**2)
+        consistency.on_rejected(0.1 * OFFSET_M)
+    assert consistency.variance_m2 == pytest.approx(probability(consistency) * 15.0**2)
 
 
 @pytest.mark.parametrize(("sigma_m", "ends"), [(5.0, True), (300.0, False)])
 def test_poses_inside_a_gate_wider_than_the_rejected_ones_do_not_end_the_inflation(sigma_m: float, ends: bool) -> None:
-    consistency = after_rejected(MapConsistency(), 4)
+    consistency = after_rejected(OtherGround(Agreement()), 4)
     before_m2 = consistency.variance_m2
     for _ in range(5):
-        consistency.add_accepted(1.0, innovation(NEAR_M, sigma_m**2 * np.eye(2)))
+        consistency.on_pose(1.0, innovation(NEAR_M, sigma_m**2 * np.eye(2)))
     assert (consistency.variance_m2 == 0.0) if ends else (consistency.variance_m2 > 0.9 * before_m2)
 
 
 def test_after_many_rejected_poses_four_accepted_ones_over_new_ground_end_the_inflation() -> None:
     """The evidence against a map is bounded: a long flight over changed ground must not outweigh the map after it."""
-    consistency = after_rejected(MapConsistency(), 200)
+    consistency = after_rejected(OtherGround(Agreement()), 200)
     for _ in range(3):
-        consistency.add_accepted(1.0, innovation(NEAR_M, NARROW_M2))
+        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2))
         assert consistency.variance_m2 > 0.0
-    consistency.add_accepted(1.0, innovation(NEAR_M, NARROW_M2))
+    consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2))
     assert consistency.variance_m2 == 0.0
 
 
 def test_after_any_number_of_accepted_poses_three_rejected_ones_inflate_the_covariance() -> None:
     """The evidence for a map is bounded, too: a map that was right for a long way can still end."""
-    consistency = MapConsistency()
+    consistency = OtherGround(Agreement())
     for _ in range(500):
-        consistency.add_accepted(1.0, innovation(NEAR_M, NARROW_M2))
-    assert after_rejected(consistency, 3).probability > 0.5
+        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2))
+    assert probability(after_rejected(consistency, 3)) > 0.5
 
 
 def test_a_pose_that_was_fused_outside_of_the_gate_of_its_position_is_no_evidence_for_the_map() -> None:
-    consistency = after_rejected(MapConsistency(), 4)
-    before = consistency.probability
-    consistency.add_accepted(1.0, innovation(np.array([5.0 * 3.8, 0.0]), NARROW_M2))  # the gate ends at 3.72 sigmas
-    assert consistency.probability == before
-    consistency.add_accepted(1.0, innovation(np.array([5.0 * 3.6, 0.0]), NARROW_M2))
-    assert consistency.probability < before
+    consistency = after_rejected(OtherGround(Agreement()), 4)
+    before = probability(consistency)
+    consistency.on_pose(1.0, innovation(np.array([5.0 * 3.8, 0.0]), NARROW_M2))  # the gate ends at 3.72 sigmas
+    assert probability(consistency) == before
+    consistency.on_pose(1.0, innovation(np.array([5.0 * 3.6, 0.0]), NARROW_M2))
+    assert probability(consistency) < before

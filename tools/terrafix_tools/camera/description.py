@@ -14,7 +14,8 @@ def write_toml(path: Path, flight: Description, note: str) -> None:
     values, tables = _split(flight)
     lines = [f"# {note}", *values]
     for name, table in tables.items():
-        lines += [f"[{name}]", *_split(table)[0]]
+        if rows := _split(table)[0]:
+            lines += [f"[{name}]", *rows]
     try:
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:

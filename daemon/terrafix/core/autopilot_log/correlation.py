@@ -20,7 +20,7 @@ Rates = tuple[float, np.ndarray, np.ndarray]  # start [s], (N, 3) [rad/s] in cel
 
 
 @dataclass(frozen=True)
-class Peak:
+class LagPeak:
     """The best lag.
 
     Lags are ranked by the score sum(x y) / sqrt(sum(x^2 y^2)): of two series that have nothing to do with each other,
@@ -59,7 +59,7 @@ def needed_lead(sigma: float, lags: int) -> float:
     return sigma * math.log(1.0 / FALSE_ALARM) / math.sqrt(2.0 * math.log(max(lags, 2)))
 
 
-def correlate(first: Rates, second: Rates, cell_s: float) -> Peak:
+def correlate(first: Rates, second: Rates, cell_s: float) -> LagPeak:
     """Tries all lags with enough overlap, and drifts that move the ends of the first series by a cell each."""
     filters = _whitening([first, second])
     (x, known_x), (y, known_y) = (_whitened(rates, filters) for rates in (first, second))
@@ -82,7 +82,7 @@ def correlate(first: Rates, second: Rates, cell_s: float) -> Peak:
     others = score[usable & (np.abs(lags - lags[at]) * cell_s > PEAK_WIDTH_S)]
     correlation = float(product[at] / math.sqrt(max(energy[at], 1e-12)))
     scale = correlation / max(float(score[at]), 1e-12)
-    return Peak(
+    return LagPeak(
         offset_s=second[0] - first[0] + cell_s * (float(lags[at]) + _vertex(score, at)),
         drift=drift,
         correlation=correlation,

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.core.autopilot_log.attitude import AttitudeSeries
+from terrafix.core.autopilot_log.correlation import LagPeak, clipped, correlate
 from terrafix.core.errors import EvaluationError
-from terrafix_tools.autopilot_log.correlation import Peak, clipped, correlate
-from terrafix_tools.autopilot_log.structure import Attitude
 
 MIN_CELL_S = 0.1  # of the grid: short enough for the manoeuvres of a copter [tuned]
 MAX_GAP_S = 1.0  # or three typical intervals: across longer ones nothing is interpolated [tuned]
@@ -81,7 +81,7 @@ class _Line:
         return self.offset_s + self.drift * (record_s - self.middle_s)
 
 
-def align(record: Attitude, log: Attitude) -> Alignment:
+def align(record: AttitudeSeries, log: AttitudeSeries) -> Alignment:
     """Both with increasing times (``cleaned``). Raises EvaluationError, one line: too little attitude, too little
     motion, or a log of another flight."""
     for name, attitude in (("record", record), ("log", log)):
@@ -112,7 +112,7 @@ def align(record: Attitude, log: Attitude) -> Alignment:
     return _accepted(record, log, cell_s, peak, line)
 
 
-def _accepted(record: Attitude, log: Attitude, cell_s: float, peak: Peak, line: _Line) -> Alignment:
+def _accepted(record: AttitudeSeries, log: AttitudeSeries, cell_s: float, peak: LagPeak, line: _Line) -> Alignment:
     """Raises EvaluationError when the log does not follow the record along the line."""
     start_s, values, known = body_rates(record, cell_s)
     grid = start_s + cell_s * np.arange(len(values) + 1)
@@ -146,7 +146,7 @@ def _accepted(record: Attitude, log: Attitude, cell_s: float, peak: Peak, line: 
     )
 
 
-def _fitted(record: Attitude, log: Attitude, peak: Peak) -> _Line:
+def _fitted(record: AttitudeSeries, log: AttitudeSeries, peak: LagPeak) -> _Line:
     line = _Line(peak.offset_s, peak.drift, 0.5 * float(record.t_s[0] + record.t_s[-1]))
     for _ in range(ITERATIONS):
         times, offsets, sigmas = _offsets_of_windows(*_differences(record, log, line))
@@ -156,7 +156,7 @@ def _fitted(record: Attitude, log: Attitude, peak: Peak) -> _Line:
     return line
 
 
-def _differences(record: Attitude, log: Attitude, line: _Line) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _differences(record: AttitudeSeries, log: AttitudeSeries, line: _Line) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """-> times of the record (N,), rotation vectors (N, 3) by which the record's attitude differs from that of the log
     at the same time, and the change of these per second by which the log is read later (N, 3).
 
@@ -242,7 +242,7 @@ def _line(times: np.ndarray, offsets: np.ndarray, sigmas: np.ndarray, middle_s: 
     )
 
 
-def body_rates(attitude: Attitude, cell_s: float) -> tuple[float, np.ndarray, np.ndarray]:
+def body_rates(attitude: AttitudeSeries, cell_s: float) -> tuple[float, np.ndarray, np.ndarray]:
     """-> start of the grid [s], mean body rates in its cells (N, 3) [rad/s], and which are known (N,)."""
     count = int((attitude.t_s[-1] - attitude.t_s[0]) / cell_s)
     grid = attitude.t_s[0] + cell_s * np.arange(count + 1)
@@ -260,7 +260,7 @@ def rms_of(rates: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum((rates - rates.mean(axis=0)) ** 2, axis=1)))) if len(rates) else 0.0
 
 
-def interpolate(attitude: Attitude, at_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def interpolate(attitude: AttitudeSeries, at_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """-> roll, pitch, yaw (N, 3) at the times, and whether they are known: inside the attitude, and not in a gap."""
     t_s = attitude.t_s
     angles = [
@@ -283,7 +283,7 @@ def rotations(angles: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def interval_s(attitude: Attitude) -> float:
+def interval_s(attitude: AttitudeSeries) -> float:
     """Typical time between two samples."""
     return float(np.median(np.diff(attitude.t_s)))
 

@@ -1,0 +1,47 @@
+"""How far away the vehicle may be if the map does not show the ground below (``Cause.OTHER_GROUND``): as far as the
+camera poses are that the innovation gate rejects and that agree with no other one."""
+
+import math
+
+import numpy as np
+
+from terrafix.core.agreement import P_REJECTED, P_REJECTED_OTHER_GROUND, RANGES, Agreement, Cause, Observed
+from terrafix.estimator.integrity.innovation import Innovation
+
+OFFSET_MEMORY = 0.7  # weight of the earlier mean in that of the squared offsets of rejected poses [tuned]
+
+
+class OtherGround:
+    def __init__(self, agreement: Agreement) -> None:
+        self.agreement = agreement
+        self._offset2_m2 = 0.0  # mean squared distance of rejected poses from the estimate
+
+    @property
+    def variance_m2(self) -> float:
+        """Per horizontal axis, times the weight of the cause."""
+        return self.agreement.weight(Cause.OTHER_GROUND) * self._offset2_m2
+
+    def on_rejected(self, offset_m: np.ndarray) -> None:
+        """A camera pose outside the gate, ``offset_m`` (2,) from the estimate, that agrees with no pose before it."""
+        self.agreement.observe(Observed.REJECTED, Cause.OTHER_GROUND)
+        offset2_m2 = float(offset_m @ offset_m)
+        self._offset2_m2 = (
+            OFFSET_MEMORY * self._offset2_m2 + (1.0 - OFFSET_MEMORY) * offset2_m2 if self._offset2_m2 else offset2_m2
+        )
+
+    def on_pose(self, information_share: float, position: Innovation) -> None:
+        """A camera pose that was fused, weighted by the share 0..1 of the ground in it that is new. ``position``: the
+        innovation of its position, with the tilt that was predicted. Poses of a wrong map are as far away as the
+        rejected ones; a gate that is wider than that accepts them too, and its poses say nothing, as those that are
+        outside of it do."""
+        if not position.is_accepted:
+            return
+        reach2_m2 = position.limit * math.sqrt(max(float(np.linalg.det(position.covariance)), 0.0))
+        in_gate = 1.0 - math.exp(-reach2_m2 / self._offset2_m2) if self._offset2_m2 else 0.0
+        if in_gate > 1.0 - P_REJECTED_OTHER_GROUND:
+            nats = min(math.log(in_gate / (1.0 - P_REJECTED)), 0.0)
+            self.agreement.add(Cause.OTHER_GROUND, information_share * nats)
+        else:
+            self.agreement.observe(Observed.POSE, Cause.OTHER_GROUND, information_share)
+        if self.agreement.log_odds[Cause.OTHER_GROUND] <= RANGES[Cause.OTHER_GROUND].least:
+            self._offset2_m2 = 0.0
