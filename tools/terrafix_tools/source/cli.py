@@ -33,7 +33,9 @@ def info(
     facts = facts_of(opened)
     opened.close()
     if json_only:
-        typer.echo(json.dumps({"source": without_password(source), "facts": [fact._asdict() for fact in facts]}, indent=2))
+        typer.echo(
+            json.dumps({"source": without_password(source), "facts": [fact._asdict() for fact in facts]}, indent=2)
+        )
         return
     for line in fact_lines(opened.name(), facts):
         typer.echo(line)

@@ -24,8 +24,8 @@ def open_source(
     timing: Timing = UNKNOWN_TIMING,
     wait_for_camera: bool = False,
 ) -> Source:
-    """Opens a flight folder, photos, a video file, or a camera: ``stream_address.is_live``. Of a fisheye lens the images
-    are those of a pinhole camera (``fisheye.view_of``).
+    """Opens a flight folder, photos, a video file, or a camera (``stream_address.is_live``). Of a fisheye lens the
+    images are those of a pinhole camera (``fisheye.view_of``).
 
     ``start`` (lat_deg, lon_deg) overrides the initial position of the source. ``camera``: a camera description; live
     cameras require it, for photos and videos it overrides theirs. ``rate_hz``: frame rate taken from a video or camera.

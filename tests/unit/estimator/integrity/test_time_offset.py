@@ -105,7 +105,7 @@ def test_in_straight_flight_a_drift_shows_as_a_velocity_that_changes_without_acc
 ) -> None:
     offset = straight(seen)
     assert (offset.sigma_s > 0.3) == far
-    assert offset.estimate[0] > 0.1 if far else offset.sigma_s <= PRIOR_SIGMA_S
+    assert offset.estimate[0] > 0.1 if far else offset.sigma_s <= STAMP_SIGMA_S
 
 
 def test_an_offset_that_nothing_observes_is_claimed_once_its_buffer_may_have_filled() -> None:
