@@ -153,7 +153,7 @@ def _run_line() -> Iterator["Callable[[RunDir], None] | None"]:
 @app.command()
 def run(
     context: typer.Context,
-    source: Annotated[str, typer.Option(help="Flight folder, photos, video, camera: docs/cameras.md.")] = "",
+    source: Annotated[str, typer.Option(help="Flight folder, photos, video, camera: docs/camera.md.")] = "",
     map_path: Annotated[Path | None, typer.Option("--map", help="Map package or GeoTIFF.")] = None,
     link: Annotated[str, typer.Option(help="udpin:H:P, udpout:H:P, tcp:H:P or a serial device.")] = "",
     out: Annotated[Path, typer.Option(help="Folder for the flight record.")] = Path("out/run"),

@@ -4,7 +4,7 @@ from collections import Counter
 
 from constants_ledger import constants
 
-MAX_TUNED = 464  # lower it when a constant gets a measurement or a specification; never raise it
+MAX_TUNED = 463  # lower it when a constant gets a measurement or a specification; never raise it
 
 
 def test_every_constant_has_a_source() -> None:

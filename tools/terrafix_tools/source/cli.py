@@ -16,7 +16,7 @@ def options() -> None:
 
 @app.command()
 def info(
-    source: Annotated[str, typer.Argument(help="Flight folder, photos, video, camera: docs/cameras.md.")],
+    source: Annotated[str, typer.Argument(help="Flight folder, photos, video, camera: docs/camera.md.")],
     start: Annotated[str, typer.Option("--start", help="LAT,LON in degrees where the flight starts.")] = "",
     config: Annotated[list[Path] | None, typer.Option("--config", help="TOML file; its [source] is used.")] = None,
     json_only: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,

@@ -33,7 +33,7 @@ from terrafix.vision.sources.stream_address import (
 )
 
 SYSTEM_PACKAGES = "/usr/lib/python3/dist-packages"  # python3-gi of Debian and Ubuntu, for the system's Python
-INSTALL = "docs/cameras.md#gstreamer says what to install"
+INSTALL = "docs/camera.md#gstreamer says what to install"
 FIRST_IMAGE_S = 10.0  # from connecting to the first image: twice a long interval of key frames [spec: 5 s]
 SLICE_NS = 100_000_000  # ns between two looks at the bus, and at whether the source is closed
 NTP_TO_UNIX_S = 2_208_988_800  # [spec: RFC 5905]
