@@ -31,7 +31,7 @@ STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5.0,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 1.0,  # whether the EKF uses our position
     mavlink.MAVLINK_MSG_ID_AIRSPEED: 5.0,
-    mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 10.0,
+    mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 5.0,  # all streams then fit 57600 baud
 }
 PX4_EQUIVALENTS = {  # ArduPilot's message -> the one that PX4 sends instead
     mavlink.MAVLINK_MSG_ID_RAW_IMU: mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,

@@ -23,7 +23,8 @@ ATTITUDE = mavlink.MAVLINK_MSG_ID_ATTITUDE
 def packed_length(message_id: int, signed: bool = False) -> int:
     """-> packed bytes of a message whose fields have no trailing zero bytes, which MAVLink 2 would truncate."""
     kind = mavlink.mavlink_map[message_id]
-    message = kind(*(_ones(t, n) for t, n in zip(kind.fieldtypes, kind.array_lengths, strict=True)))
+    lengths = [kind.array_lengths[place] for place in kind.orders]  # they are in the order of the wire
+    message = kind(*(_ones(t, n) for t, n in zip(kind.fieldtypes, lengths, strict=True)))
     mav = mavlink.MAVLink(None)
     if signed:
         mav.signing.secret_key, mav.signing.sign_outgoing = bytes(32), True
