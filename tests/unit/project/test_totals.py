@@ -12,7 +12,7 @@ CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
 LINES = {"daemon": 39200, "engines": 1730, "tools": 61100, "tests": 65200}
-WORDS = 71150  # of all documents
+WORDS = 71200  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 

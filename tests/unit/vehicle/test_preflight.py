@@ -341,7 +341,8 @@ class Streaming(GroundAutopilot):
             each = rate_hz * self._share
             for _ in range(int(each * self.now_s) - int(each * before_s)):
                 kind = mavlink.mavlink_map[message_id]
-                self._send(kind(*([0] * n if n else 0 for n in kind.array_lengths)))
+                lengths = (kind.array_lengths[place] for place in kind.orders)
+                self._send(kind(*([0] * n if n else 0 for n in lengths)))
         return super().read()
 
 
