@@ -4,6 +4,7 @@ import importlib
 import json
 import math
 import os
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,12 +21,14 @@ from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import start_is_unknown, with_map_center
 from terrafix.core.node import Node, NodeContext
+from terrafix.core.passwords import without_password
 from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, SourceEnded
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import header, versions
 from terrafix.vision.sources import Source, open_configured
 from terrafix.vision.sources.facts import facts_of
+from terrafix.vision.sources.stream_address import is_live
 from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import StoredModel, models_folder, resolve_model
 from terrafix_tools.flight_map import package_of
@@ -73,10 +76,13 @@ def replay(
     """
     began_s = time.perf_counter()
     config = _with_models(load(configs or []), models or [])
-    opened = open_configured(config.source, str(flight), start) if isinstance(flight, (str, Path)) else flight
-    source = wrap_source(opened)
-    if source.live:
-        raise UsageError(f"{flight}: a live camera cannot be replayed; fly it with 'terrafix run --source {flight}'")
+    if isinstance(flight, (str, Path)):
+        name = re.sub(r"^([a-z]+):/(?!/)", r"\1://", str(flight))  # a Path has made one slash of two
+        if is_live(name) and not Path(flight).exists():
+            shown = without_password(name)
+            raise UsageError(f"{shown}: a live camera cannot be replayed; fly it with 'terrafix run --source {shown}'")
+        flight = open_configured(config.source, str(flight), start)
+    opened, source = flight, wrap_source(flight)
     package = package_of(_map_of(map_path, config, source), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
     facts = facts_of(opened)

@@ -3,12 +3,13 @@
 import socket
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from simulated_flight import CAMERA
 from terrafix.core.config import Config, SourceSection, without_passwords
-from terrafix.core.errors import SourceError
+from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.passwords import without_password
 from terrafix.recorder.provenance import header
 from terrafix.vision.sources.stream_address import (
@@ -20,6 +21,7 @@ from terrafix.vision.sources.stream_address import (
     parse_network,
     pipeline_of,
 )
+from terrafix_tools.replay import replay
 
 JETSON = {"nvarguscamerasrc", "nvvidconv", "nvv4l2decoder", "avdec_h264", "avdec_h265", "jpegdec", "rtmp2src"}
 DESKTOP = {"avdec_h264", "avdec_h265", "jpegdec", "rtmp2src"}
@@ -152,3 +154,10 @@ def test_no_password_is_shown(spec: str) -> None:
 def test_an_address_without_a_password_is_shown_as_it_is() -> None:
     for spec in ("rtsp://10.0.0.1:554/s?user=a", "udp://:5600", "/dev/video0", "v4l2src ! jpegdec", "flights/a@b:c"):
         assert without_password(spec) == spec
+
+
+@pytest.mark.parametrize("flight", ["rtsp://a:hunter2@h/s", Path("rtsp://a:hunter2@h/s"), "/dev/video77"])
+def test_a_camera_is_not_replayed_nor_its_password_shown(flight: str | Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="a live camera cannot be replayed") as refused:
+        replay(flight, None, tmp_path / "out")
+    assert "hunter2" not in str(refused.value)

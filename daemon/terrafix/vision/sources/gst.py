@@ -36,6 +36,12 @@ SYSTEM_PACKAGES = "/usr/lib/python3/dist-packages"  # python3-gi of Debian and U
 INSTALL = "docs/camera.md#gstreamer says what to install"
 FIRST_IMAGE_S = 10.0  # from connecting to the first image: twice a long interval of key frames [spec: 5 s]
 SLICE_NS = 100_000_000  # ns between two looks at the bus, and at whether the source is closed
+# bytes of the socket of a stream over UDP, of which the kernel grants net.core.rmem_max: a key frame arrives at once
+UDP_BUFFER = 4 << 20  # [spec: four times the largest key frame that a camera of 50 Mbit/s sends]
+# Properties by which depayloaders ask and wait for a key frame after a lost packet, and decoders leave out damaged
+# images.
+REFUSE_DAMAGED = {"wait-for-keyframe": True, "request-keyframe": True, "output-corrupt": False}
+H265_PARSER = "h265parse"  # what it gets is not waited for: GStreamer's depayloader of H.265 has no such property
 NTP_TO_UNIX_S = 2_208_988_800  # [spec: RFC 5905]
 MAX_STAMP_AGE_NS = 10_000_000_000  # an older stamp, or one of the future, is of another clock
 FULL_RANGE = ("1:", "jpeg", "sRGB")  # begin of GStreamer's names of colorimetry with 0 to 255
@@ -106,6 +112,9 @@ class GstCapture:
             self._pipeline = self._gst.parse_launch(text)
         except Exception as error:  # noqa: BLE001  # GLib.Error, whose class exists only where PyGObject does
             raise SourceError(f"{self._shown}: not a pipeline that GStreamer can make ({error})") from None
+        self._pipeline.connect("deep-element-added", lambda _pipeline, _parent, element: self._refuse_damaged(element))
+        for element in self._elements():
+            self._refuse_damaged(element)
         if self._network:
             self._address(spec, codec, payload)
         self._sink, self._bus = self._pipeline.get_by_name("sink"), self._pipeline.get_bus()
@@ -196,7 +205,7 @@ class GstCapture:
             if self._failed():
                 return False
             if time.monotonic() > end_s:
-                self.why = self._missing or f"no image for {limit_s:g} s, though the camera answers"
+                self.why = self._missing or f"no undamaged image for {limit_s:g} s, though the camera answers"
                 return False
         self.why = "closed"
         return False
@@ -222,6 +231,8 @@ class GstCapture:
         kind = self._gst.ResourceError
         if error.matches(self._gst.resource_error_quark(), kind.NOT_AUTHORIZED) or "Unauthorized" in detail:
             return "the camera refuses user and password; write rtsp://USER:PASSWORD@..., with %40 for @ and %2F for /"
+        if error.matches(self._gst.resource_error_quark(), kind.OPEN_READ_WRITE):
+            return "no connection; is the camera on, and its address right?"
         if error.matches(self._gst.resource_error_quark(), kind.NOT_FOUND):
             return "the camera has no such stream; look up its address in the manual"
         last = detail.strip().splitlines()[-1] if detail.strip() else ""
@@ -231,6 +242,7 @@ class GstCapture:
         address, source = parse_network(spec), self._pipeline.get_by_name("source")
         if spec.startswith("udp://"):
             source.set_property("port", address.port)
+            source.set_property("buffer-size", UDP_BUFFER)
             if address.host:
                 source.set_property("address", address.host)
             if codec:
@@ -251,6 +263,14 @@ class GstCapture:
         if source.find_property("add-reference-timestamp-meta") is not None:  # since 1.22
             source.set_property("add-reference-timestamp-meta", True)
 
+    def _refuse_damaged(self, element: Any) -> None:
+        for name, value in REFUSE_DAMAGED.items():
+            if element.find_property(name) is not None:
+                element.set_property(name, value)
+        if element.get_factory() is not None and element.get_factory().get_name() == H265_PARSER:
+            probe = _UndamagedImages(self._gst)
+            element.get_static_pad("src").add_probe(self._gst.PadProbeType.BUFFER, probe)
+
     def _elements(self) -> list[Any]:
         elements: list[Any] = []
         iterator = self._pipeline.iterate_recurse()
@@ -259,6 +279,20 @@ class GstCapture:
             if result != self._gst.IteratorResult.OK:
                 return elements
             elements.append(element)
+
+
+class _UndamagedImages:
+    """Probe of a parser's output: lets encoded images pass. One before which packets were lost may lack a part, and
+    later ones show that part until a key frame comes."""
+
+    def __init__(self, Gst: Any) -> None:
+        self._gst, self._waiting, self._first = Gst, True, True
+
+    def __call__(self, pad: Any, info: Any) -> Any:
+        flags, kinds = info.get_buffer().get_flags(), self._gst.BufferFlags
+        lost, self._first = bool(flags & kinds.DISCONT) and not self._first, False
+        self._waiting = lost or (self._waiting and bool(flags & kinds.DELTA_UNIT))
+        return self._gst.PadProbeReturn.DROP if self._waiting else self._gst.PadProbeReturn.OK
 
 
 def _is_decoder(element: Any) -> bool:
