@@ -213,3 +213,11 @@ def test_a_new_origin_resets_the_time_offset() -> None:
     assert listener.estimate(11).t_ns == t_ns(11)
     first = [m for m in listener.published if isinstance(m, Prediction) and m.frame_id == 10][-1]
     assert np.hypot(*first.step_m) < 1e-9
+
+
+@pytest.mark.parametrize("sigma_s", [0.005, 0.2])
+def test_the_prior_of_the_offset_is_what_the_source_knows_of_its_stamps(sigma_s: float) -> None:
+    offset = TimeOffset(R_B_C)
+    offset.stamped(Frame(t_ns=0, frame_id=0, file="", width=1, height=1, buffered=True, stamp_sigma_s=sigma_s))
+    assert offset.buffered and offset.applied_s == 0.0
+    assert sigma_s <= offset.sigma_s <= 1.5 * sigma_s  # 1 % of the cameras may be off by anything
