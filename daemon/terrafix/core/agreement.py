@@ -65,7 +65,7 @@ class Range:
 
 
 RANGES: dict[Cause, Range] = {
-    # Until map matches that agree with each other contradict the estimate, nothing speaks for another place.
+    # Until map matches that agree with each other contradict the estimate, there is no evidence for another place.
     Cause.ELSEWHERE: Range(-math.inf, -math.inf, 0.0),
     # A map that was right for a kilometre can still end. [tuned]
     Cause.OTHER_GROUND: Range(-6.0, -6.0, 4.0),

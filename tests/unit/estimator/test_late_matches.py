@@ -121,7 +121,7 @@ def test_what_a_search_found_knows_its_ground_however_late_it_is() -> None:
     run.feed([newer, found])
     estimate = run.estimate(41)
     assert estimate.alt_amsl_m - estimate.agl_m == pytest.approx(20.0, abs=0.5)
-    # Frame 41 stays the newest one whose match has told the ground: that of frame 38 does not.
+    # Frame 41 stays the newest one by whose match the ground was updated: that of frame 38 is older.
     run.feed([msgspec.structs.replace(flight.fix(38), verdict=Verdict.AMBIGUOUS, ground=plane(4.0))])
     run.feed([m for m in flight.messages(42) if not isinstance(m, MapMatch)])
     estimate = run.estimate(42)

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
-from terrafix.core.autopilot_log.dataflash import Table, read_dataflash
+from terrafix.core.autopilot_log.dataflash import Table, attitude_of, read_dataflash
 from terrafix.core.errors import SourceError
 from terrafix.link.output.odometry import ARDUPILOT_M_PER_E7
 from terrafix_tools.autopilot_log.structure import (
@@ -94,7 +93,7 @@ def read_ardupilot(path: Path) -> AutopilotLog:
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror})") from None
     found = flash.tables
-    attitude = _attitude(found.get("ATT", _EMPTY))
+    attitude = attitude_of(found.get("ATT", _EMPTY))
     if not attitude.t_s.size:
         raise SourceError(f"{path}: holds no attitude (ATT); set LOG_BITMASK to record it, or give another log")
     firmware = _firmware(found.get("MSG", _EMPTY).texts("Message"))
@@ -135,10 +134,6 @@ def read_ardupilot(path: Path) -> AutopilotLog:
 
 
 _EMPTY = Table({}, {}, np.zeros(0, int), np.zeros(0))
-
-
-def _attitude(table: Table) -> AttitudeSeries:
-    return cleaned(AttitudeSeries(table.t_s, *(np.radians(table.column(name)) for name in ("Roll", "Pitch", "Yaw"))))
 
 
 def _rates(found: dict[str, Table]) -> BodyRates | None:

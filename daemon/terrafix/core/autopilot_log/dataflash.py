@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
+
 HEAD = b"\xa3\x95"
 FMT_TYPE, FMT_LENGTH = 128, 89
 _FMT = struct.Struct("<BB4s16s64s")
@@ -108,6 +110,11 @@ class DataFlash:
     tables: dict[str, Table]
     counts: Counter[str]  # messages of all types in the file
     skipped_bytes: int
+
+
+def attitude_of(att: Table) -> AttitudeSeries:
+    """Of the messages ATT, whose angles are in degrees."""
+    return cleaned(AttitudeSeries(att.t_s, *(np.radians(att.column(name)) for name in ("Roll", "Pitch", "Yaw"))))
 
 
 def is_dataflash(head: bytes) -> bool:

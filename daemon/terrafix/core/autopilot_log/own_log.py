@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from terrafix.core.autopilot_log import dataflash, ulog
 from terrafix.core.autopilot_log.alignment import align
 from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
 from terrafix.core.autopilot_log.dataflash import Table, is_dataflash, read_dataflash
@@ -154,13 +155,13 @@ def _of_ardupilot(path: Path) -> _Read:
     flash = read_dataflash(path, _FLASH)
     empty = Table({}, {}, np.zeros(0, int), np.zeros(0))
     tables = {name: flash.tables.get(name, empty) for name in _FLASH}
-    att, pos = tables["ATT"], tables["POS"]
+    pos = tables["POS"]
     baro, imu, speeds = (tables[name].by_instance("I").get(0, empty) for name in ("BARO", "IMU", "ARSP"))
     heights = (pos.t_s, pos.column("RelHomeAlt")) if pos.has("RelHomeAlt") else (baro.t_s, baro.column("Alt"))
     healthy = (speeds.column("H", 1.0) > 0) & np.isfinite(speeds.column("Airspeed"))
     events = tables["EV"]
     return _Read(
-        attitude=cleaned(AttitudeSeries(att.t_s, *(np.radians(att.column(name)) for name in ("Roll", "Pitch", "Yaw")))),
+        attitude=dataflash.attitude_of(tables["ATT"]),
         heights=heights,
         forces=(imu.t_s, np.stack([imu.column(f"{kind}{axis}") for kind in ("Acc", "Gyr") for axis in "XYZ"], axis=1)),
         armed=[
@@ -190,9 +191,6 @@ def _of_px4(topics: dict[str, dict[int, Topic]]) -> _Read:
         return instances[min(instances)]
 
     turned, moved, status, sensors = (first(name) for name in _TOPICS[:4])
-    w, x, y, z = columns(turned, "q[0]", "q[1]", "q[2]", "q[3]").T
-    roll, yaw = (np.arctan2(2 * (w * a + b * c), 1 - 2 * (a * a + b * b)) for a, b, c in ((x, y, z), (z, y, x)))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     is_armed = numbers(status, "arming_state") == PX4_ARMED
     armed = [(float(t), bool(on)) for t, on in zip(sampled_s(status), is_armed, strict=True)]
     up_s, up_m = sampled_s(moved), -numbers(moved, "z")
@@ -201,7 +199,7 @@ def _of_px4(topics: dict[str, dict[int, Topic]]) -> _Read:
     zero_m = float(up_m[known[0]]) if len(known) else 0.0
     accel, gyro = ([f"{name}[{i}]" for i in range(3)] for name in ("accelerometer_m_s2", "gyro_rad"))
     return _Read(
-        attitude=cleaned(AttitudeSeries(sampled_s(turned), roll, pitch, yaw)),
+        attitude=ulog.attitude_of(turned),
         heights=(up_s, up_m - zero_m),
         forces=(sampled_s(sensors), columns(sensors, *accel, *gyro)),
         armed=armed,

@@ -75,7 +75,7 @@ class GimbalReports:
     @property
     def unchanged_since_ns(self) -> int | None:
         """Since when all reports are the same to the last bit; None: for less than FROZEN_NS. A gimbal holds its angle
-        so only while nothing moves it: such reports repeat an old one, or the angle that it was told."""
+        so only while nothing moves it: such reports repeat an old one, or the commanded angle."""
         if not self._reports or self._reports[-1].t_ns - self._changed_ns < FROZEN_NS:
             return None
         return self._changed_ns
