@@ -10,17 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.estimator.integrity.offset_drift import STEP_S
-from terrafix.estimator.integrity.time_offset import (
-    INDEPENDENT_SHARE,
-    REPORT_WAIT_NS,
-    UNSTAMPED_SHARE,
-)
+from terrafix.estimator.integrity.time_offset import REPORT_WAIT_NS, UNSTAMPED_SHARE
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import STAMP_SIGMA_S
 
 GRID_S = np.arange(-2.0, 2.0001, STEP_S)  # s: offsets of the density [spec: offset_drift.py, to 2 s both ways]
 MIN_TURN_SIGMA_RAD = np.radians(0.3)  # lower limit of the 1-sigma of a turn between two frames [tuned]
 MOUNT_PITCH_SIGMA_RAD = np.radians(1.5)  # 1-sigma of the mount pitch that remains after its calibration [tuned]
+INDEPENDENT_SHARE = 0.5  # of the turns: two consecutive ones share a frame [tuned]
 MEMORY_TURNS = 300.0  # turns: time constant of the exponential forgetting of the sums [tuned]
 
 

@@ -189,16 +189,14 @@ class Telemetry:
         at_ns = t_ns[:, None] + about_ns
         return np.stack([np.interp(at_ns, turns[0], angle).mean(axis=1) for angle in _unwrapped(turns[1])])
 
-    def attitudes_about(self, t_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """-> R_w_b (N, 3, 3) about times (N,) [ns], as ``turned_about``, and sines of roll and pitch (N,), as complex
-        numbers; of what the camera is fixed to."""
+    def attitudes_about(self, t_ns: np.ndarray) -> np.ndarray | None:
+        """-> R_w_b (N, 3, 3) about times (N,) [ns], as ``turned_about``, of what the camera is fixed to."""
         angles = self.turned_about(t_ns)
         if angles is not None and self.gimbal.used:
             angles = self.gimbal.angles_about(t_ns, angles[0])
         if angles is None:
             return None
-        r_w_b = np.stack([rotate_to_world([*axis], *angles) for axis in np.eye(3)], axis=2)
-        return r_w_b, np.sin(angles[2]) + 1j * np.sin(angles[1])
+        return np.stack([rotate_to_world([*axis], *angles) for axis in np.eye(3)], axis=2)
 
     def velocity_changes(self, t0_ns: int, t1_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
         """(N,) complex, east + j north [m/s]: change of velocity from ``t0_ns`` to ``t1_ns``, both less each of
@@ -212,6 +210,21 @@ class Telemetry:
         ends = (np.interp((t_ns - first_ns) * 1e-9 - offset_s, world.s_s, mps) for t_ns in (t0_ns, t1_ns))
         before, after = ends
         return np.asarray(after - before)
+
+    def turns_by_gyro(self, t0_ns: int, t1_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
+        """(N, 3): rotation of the vehicle about east, north and up [rad] from ``t0_ns`` to ``t1_ns``, both less each of
+        ``offset_s`` (N,), by the gyroscopes. None when readings or attitudes do not cover that, or when a gimbal holds
+        the camera."""
+        first_ns, last_ns = t0_ns - round(offset_s.max() * 1e9), t1_ns - round(offset_s.min() * 1e9)
+        known = None if self.gimbal.used else self._with_attitudes(self._rates, first_ns, last_ns)
+        if known is None:
+            return None
+        (t_g, rates), (t_a, angles) = known
+        rates_w = rotate_to_world(rates, *(np.interp(t_g, t_a, angle) for angle in _unwrapped(angles)))
+        s_s = (t_g - t_g[0]) * 1e-9
+        turned = np.vstack([np.zeros(3), np.cumsum(0.5 * (rates_w[1:] + rates_w[:-1]) * np.diff(s_s)[:, None], axis=0)])
+        at_s = [(t_ns - t_g[0]) * 1e-9 - offset_s for t_ns in (t0_ns, t1_ns)]
+        return np.column_stack([np.interp(at_s[1], s_s, axis) - np.interp(at_s[0], s_s, axis) for axis in turned.T])
 
     def turn_without_gyro(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
         """-> rotation (3,) about east, north and up [rad] by which the attitude turned from ``t0_ns`` to ``t1_ns`` and
