@@ -220,7 +220,7 @@ class Telemetry:
         if known is None:
             return None
         (t_g, rates), (t_a, angles) = known
-        rates_w = rotate_to_world(rates, *(np.interp(t_g, t_a, angle) for angle in _unwrapped(angles)))
+        rates_w = rotate_to_world([*rates], *(np.interp(t_g, t_a, angle) for angle in _unwrapped(angles)))
         s_s = (t_g - t_g[0]) * 1e-9
         turned = np.vstack([np.zeros(3), np.cumsum(0.5 * (rates_w[1:] + rates_w[:-1]) * np.diff(s_s)[:, None], axis=0)])
         at_s = [(t_ns - t_g[0]) * 1e-9 - offset_s for t_ns in (t0_ns, t1_ns)]
