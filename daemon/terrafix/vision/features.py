@@ -8,11 +8,10 @@ import numpy as np
 
 SIFT_FEATURES = 1500
 SIFT_RATIO = 0.8  # ratio test, Lowe 2004
-MIN_SIZE_PX = (
-    1.8  # diameter of the smallest feature that SIFT finds [spec: sigma of 1.6 px in an image of twice the size]
-)
+# diameter of the smallest feature that SIFT finds [spec: sigma of 1.6 px in an image of twice the size]
+MIN_SIZE_PX = 1.8
 
-_NO_POINTS, _NO_VALUES = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+NO_POINTS, _NO_VALUES = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class SiftMatcher:
     def describe(self, gray: np.ndarray) -> Features:
         keypoints, descriptors = self._sift.detectAndCompute(gray, None)
         if descriptors is None:
-            return Features(_NO_POINTS, np.zeros((0, 128), np.float32), _NO_VALUES, _NO_VALUES)
+            return Features(NO_POINTS, np.zeros((0, 128), np.float32), _NO_VALUES, _NO_VALUES)
         order = np.argsort([-k.response for k in keypoints], kind="stable")
         keypoints = [keypoints[i] for i in order]
         xy_px = np.array([k.pt for k in keypoints], np.float32)

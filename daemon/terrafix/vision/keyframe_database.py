@@ -14,7 +14,7 @@ import numpy as np
 from terrafix.vision.covisibility import COARSE_FEATURES
 from terrafix.vision.features import Features
 
-MAX_KEYFRAMES = 512  # 22 MiB; 18 km of new ground at 90 m above it [measured: docs/decisions/048]
+MAX_DATABASE_KEYFRAMES = 512  # 22 MiB; 18 km of new ground at 90 m above it [measured: docs/decisions/048]
 WORDS = 512
 VOCABULARY_KEYFRAMES = 8  # from whose descriptors the words are taken; before that all keyframes are candidates
 DESCRIPTOR_SIZE = 128  # [spec: SIFT]
@@ -77,7 +77,7 @@ class _Places:
 class KeyframeDatabase:
     """``add`` keyframes in order of time; ``candidates`` for an image."""
 
-    def __init__(self, max_keyframes: int = MAX_KEYFRAMES) -> None:
+    def __init__(self, max_keyframes: int = MAX_DATABASE_KEYFRAMES) -> None:
         self._max_keyframes = max_keyframes
         self._places = _Places(max_keyframes + 1)  # the newest is in before one is removed, which may be itself
         self._words: np.ndarray | None = None  # (WORDS, C)

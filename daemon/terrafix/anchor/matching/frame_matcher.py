@@ -10,7 +10,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, Describer, MapFeatures
+from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, patch_centres, rectify
@@ -20,10 +20,10 @@ from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
 from terrafix.core.pnp import (
-    CUTOFF,
-    INDEPENDENT_SHARE,
+    INDEPENDENT_MATCH_SHARE,
     INLIER_THRESHOLD,
     PNP_MIN_INLIERS,
+    POSE_CUTOFF,
     SEARCH_RADIUS,
     PnpResult,
     solve,
@@ -176,7 +176,7 @@ class FrameMatcher:
         camera: CameraCalibration,
         source: LocalMap,
         describer: Describer,
-        cache_bytes: int = CACHE_BYTES,
+        cache_bytes: int = DESCRIPTOR_CACHE_BYTES,
         store: DescriptorStore | None = None,
         drawn: bool = False,
         correlator: GraphCorrelator | None = None,
@@ -390,7 +390,7 @@ def levelled_view(view: View, fix: PatchFix) -> View:
     """``view_of_fix``, with the tilt that was predicted as a prior. A dozen patches leave the tilt to some degrees, and
     the position to as much of the height: a frame rectified by them alone would be another one for each patch more."""
     assert fix.pnp.fit is not None and fix.given is not None
-    agrees = fix.weights * biweight(fix.pnp.fit.residuals, CUTOFF * fix.given.threshold)
+    agrees = fix.weights * biweight(fix.pnp.fit.residuals, POSE_CUTOFF * fix.given.threshold)
     r_w_c, p_m = view.r_w_c, fix.pnp.fit.p_c_in_w_m
     fit = fit_pose(
         fix.points_w_m,
@@ -399,7 +399,7 @@ def levelled_view(view: View, fix: PatchFix) -> View:
         p_m,
         fix.given.sigma_floor,
         agrees,
-        INDEPENDENT_SHARE,
+        INDEPENDENT_MATCH_SHARE,
         tilt_sigma_rad=view.tilt_sigma_rad,
     )
     return view_of_fix(view, fix if fit is None else replace(fix, pnp=replace(fix.pnp, fit=fit)))

@@ -14,7 +14,7 @@ MAX_PATCHES = 48  # patches per frame [tuned]
 LEAST_INSIDE = 0.96  # [spec: two of the 50 cells of its side are outside]
 # Share from which a patch has its full weight by having more texture than the first that is left out
 MORE_TEXTURE = 0.05  # [spec: 1 % of the texture changes a weight by a fifth]
-MIN_CORRELATION = 0.2  # correlation at the peak below which a patch is rejected as noise [tuned]
+MIN_PATCH_CORRELATION = 0.2  # correlation at the peak below which a patch is rejected as noise [tuned]
 # standard deviations of the patch's surface between the peak and the second peak; less is ambiguous [tuned]
 MIN_MARGIN = 0.35
 # From these a peak has its full weight: correlation, and margin in MIN_MARGIN; between them and the least ones the
@@ -217,14 +217,14 @@ def _peaks(surfaces: np.ndarray, expected: np.ndarray) -> _Peaks:
     margin = best - elsewhere.max(axis=(1, 2))
     is_inside = (np.minimum(r, c) > 0) & (np.maximum(r, c) < n - 1)
     clear = margin / np.maximum(MIN_MARGIN * surfaces.std(axis=(1, 2)), 1e-9)
-    index = np.flatnonzero(is_inside & (best >= MIN_CORRELATION) & (clear >= 1.0))
+    index = np.flatnonzero(is_inside & (best >= MIN_PATCH_CORRELATION) & (clear >= 1.0))
     i, r, c, best = index, r[index], c[index], best[index].astype(float)
     rows = r + _vertex(surfaces[i, r - 1, c], best, surfaces[i, r + 1, c])
     columns = c + _vertex(surfaces[i, r, c - 1], best, surfaces[i, r, c + 1])
     place = np.column_stack([rows, columns])
     to_border = (n // 2 - 1.5 - np.abs(place - n // 2 - expected)) / BORDER_CELLS
     fade = np.clip((clear[i] - 1.0) / (FULL_MARGIN - 1.0), 0.0, 1.0)
-    fade *= np.clip((best - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION), 0.0, 1.0)
+    fade *= np.clip((best - MIN_PATCH_CORRELATION) / (FULL_CORRELATION - MIN_PATCH_CORRELATION), 0.0, 1.0)
     fade *= np.clip(to_border, 0.0, 1.0).prod(axis=1)
     used = fade > 0.0
     return _Peaks(i[used], place[used], (best**2 * fade)[used])

@@ -31,9 +31,8 @@ BLOCK_HUBER_K = 1.5  # Huber threshold, in expected norms of the whitened residu
 # of its estimate. The modelled part is equal in all frames and looks like a tilt that grows with the distance flown,
 # so it is a state; the rest is noise. [tuned]
 K1_MODEL_SIGMA, K1_MODEL_SHARE = 0.0015, 0.05
-REDUCED_SIZE = (
-    11  # 6 of the step, 3 of the keyframe's tilt, 1 of the lens, 1 unexplained norm [spec: columns of the QR]
-)
+# 6 of the step, 3 of the keyframe's tilt, 1 of the lens, 1 unexplained norm [spec: columns of the QR]
+REDUCED_SIZE = 11
 STEP_AND_CONSTANT = [0, 1, 2, 3, 4, 5, 10]  # columns of the QR [spec: order of the stacked Jacobian]
 TILT_COLUMNS, K1_COLUMN = slice(6, 9), 9  # [spec: order of the stacked Jacobian]
 STEP_COLUMNS, CONSTANT_COLUMN = slice(0, 6), 6  # of the reduced step and constant [spec: STEP_AND_CONSTANT]

@@ -15,33 +15,43 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
-from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_S2, Hazards, predicted, transitions
+from terrafix.estimator.integrity.offset_drift import (
+    DRIFT_GRID_S,
+    RATES,
+    RESOLUTION_S2,
+    Hazards,
+    predicted,
+    transitions,
+)
 from terrafix.estimator.integrity.velocity_evidence import VelocityEvidence
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.monitors.levelling import ACCELERATION_SIGMA_MPS2
-from terrafix.estimator.monitors.visual_motion import MIN_DOWN, MIN_PAIRS
+from terrafix.estimator.monitors.visual_motion import MIN_RAY_DOWN, MIN_VELOCITY_PAIRS
 from terrafix.messages import STAMP_SIGMA_S, CalibrationFault, Frame, Odometry, Verdict
 
 FAR_S = 3.0 * STAMP_SIGMA_S  # s: a larger offset is not that of transfer alone [spec: three sigmas]
 UNSTAMPED_SHARE = 0.01  # of cameras whose buffers or pipeline may delay by anything on the grid [tuned]
 OUTSIDE_S = 5.0  # s, 1-sigma of an offset at the end of the grid, or beyond it [spec: the width of the grid]
 # Hazard of a buffer that lies between exposure and stamp: one that begins to fill in an hour of flight, one that jumps
-# in five; elsewhere a false alarm of the monitors. [spec: FALSE_ALARM_HOURS, monitors/cusum.py, at a stamp of exposure]
+# in five; elsewhere a false alarm. [spec: MONITOR_FALSE_ALARM_HOURS, monitors/cusum.py, at a stamp of exposure]
 BUFFERED, STAMPED = Hazards(1.0 / 3600.0, 0.2 / 3600.0), Hazards(1.0 / 3.6e6, 1.0 / 3.6e6)
-MAX_PAIRS = 24  # of an image, spread over it: more do not improve what the attitude's noise limits [measured: 40 pairs]
+# of an image, spread over it: more do not improve what the attitude's noise limits [measured: 40 pairs]
+MAX_COMPARED_PAIRS = 24
 # ns between two frames that are compared: the error of an attitude grows slower than what the vehicle turns.
 MIN_SPAN_NS = 400_000_000  # [measured: docs/decisions/058]
-MIN_TURN_SIGMA_RAD, MIN_TILT_SIGMA_RAD = np.radians(0.1), np.radians(0.05)  # of changes between two frames [tuned]
+# of changes between two frames [tuned]
+MIN_OFFSET_TURN_SIGMA_RAD, MIN_TILT_SIGMA_RAD = np.radians(0.1), np.radians(0.05)
 # 1-sigma of the mount's tilt, by which a roll looks like a turn, or a jump [spec: twice that of turn_comparison.py]
 MOUNT_SIGMA_RAD = np.radians(3.0)
 INERTIAL_SIGMA_MPS2 = 0.2  # with them: a tilt that is wrong by a degree [spec: attitude_sigma_deg]
 NOISE_MEMORY = 50.0  # comparisons: 20 s [spec: twice attitude_slow_s of the simulated sensors]
-INDEPENDENT_SHARE = 0.5  # of the comparisons: two consecutive ones share a frame [tuned]
+INDEPENDENT_COMPARISON_SHARE = 0.5  # of the comparisons: two consecutive ones share a frame [tuned]
 # Least share of the noise that the images have. Without a limit two of three healthy flights had a false offset.
 MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
 # Variance of a position by images over that of its change in a span, which a third would be if attitudes were white.
 CORRELATED = 4.0  # [measured: docs/decisions/058]
-MAX_GAP_S = 2.0  # s between two velocities that are compared [spec: the slowest camera, a frame in two seconds]
+# s between two velocities that are compared [spec: the slowest camera, a frame in two seconds]
+MAX_VELOCITY_GAP_S = 2.0
 MAX_NATS = 6.0  # of one comparison: twice MAX_STEP of the monitors [spec: monitors/cusum.py]
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
 APPLY_MAX_SIGMA_S = 0.25  # s: largest 1-sigma of an offset that is applied [tuned]
@@ -128,12 +138,12 @@ class TimeOffset:
         self._stamps_ns[odometry.frame_id] = self._newest_ns = odometry.t_ns
         self._density = None
         keyframe_ns = self._stamps_ns.get(odometry.keyframe_id)
-        seen = odometry.verdict is Verdict.ACCEPTED and len(odometry.two_view) >= MIN_PAIRS
+        seen = odometry.verdict is Verdict.ACCEPTED and len(odometry.two_view) >= MIN_VELOCITY_PAIRS
         if seen and keyframe_ns is not None and keyframe_ns < odometry.t_ns:
-            pairs = np.array(odometry.two_view[:: max(1, len(odometry.two_view) // MAX_PAIRS)])
+            pairs = np.array(odometry.two_view[:: max(1, len(odometry.two_view) // MAX_COMPARED_PAIRS)])
             frames = odometry.frame_id, odometry.keyframe_id, keyframe_ns, odometry.t_ns
             self._pending.append(_View(*frames, pairs, max(agl_m, 1.0)))
-        reach_ns = round(-GRID_S[0] * 1e9) + REPORT_WAIT_NS
+        reach_ns = round(-DRIFT_GRID_S[0] * 1e9) + REPORT_WAIT_NS
         while self._pending and self._pending[0].t_ns + reach_ns <= telemetry.newest_turn_ns:
             self._compare(self._pending.popleft(), telemetry)
         while self._pending and self._pending[0].t_ns + 2 * reach_ns < odometry.t_ns:  # no attitude is reported
@@ -141,7 +151,7 @@ class TimeOffset:
 
     @property
     def density(self) -> np.ndarray:
-        """Probabilities over ``GRID_S`` at the newest frame."""
+        """Probabilities over ``DRIFT_GRID_S`` at the newest frame."""
         if self._density is None:
             since_s = 0.0 if self._at_ns is None else (self._newest_ns - self._at_ns) * 1e-9
             self._density = predicted(self._mass, since_s, self._hazards).sum(axis=0)
@@ -150,7 +160,7 @@ class TimeOffset:
     @property
     def estimate(self) -> tuple[float, float]:
         """Mean and 1-sigma of the density [s]."""
-        mean_s = float(self.density @ GRID_S)
+        mean_s = float(self.density @ DRIFT_GRID_S)
         return mean_s, self._sigma_about(mean_s)
 
     @property
@@ -203,10 +213,10 @@ class TimeOffset:
 
     def _far(self, from_s: float) -> float:
         """Probability of an offset that is not within FAR_S of ``from_s``."""
-        return float(self.density[np.abs(GRID_S - from_s) > FAR_S].sum())
+        return float(self.density[np.abs(DRIFT_GRID_S - from_s) > FAR_S].sum())
 
     def _sigma_about(self, from_s: float) -> float:
-        return float(np.sqrt(self.density @ (GRID_S - from_s) ** 2 + RESOLUTION_S2))
+        return float(np.sqrt(self.density @ (DRIFT_GRID_S - from_s) ** 2 + RESOLUTION_S2))
 
     def _compare(self, view: _View, telemetry: Telemetry) -> None:
         now = self._levelled(view, telemetry)
@@ -226,7 +236,7 @@ class TimeOffset:
         moved, middle_ns = (now.moved - before.moved) / span_s, (now.t_ns + before.t_ns) // 2
         faster = self._velocity = _Velocity(middle_ns, span_s, moved, mount2 / span_s**2)
         turned_rad = (now.turned_rad - before.turned_rad + np.pi) % (2.0 * np.pi) - np.pi
-        log = self._log_likelihood(0, turned_rad, mount2, MIN_TURN_SIGMA_RAD**2, 1)
+        log = self._log_likelihood(0, turned_rad, mount2, MIN_OFFSET_TURN_SIGMA_RAD**2, 1)
         if slower is not None:
             jump, floor = _jump(slower, faster, view.agl_m, telemetry)
             log = log + self._log_likelihood(1, jump, 0.5 * (faster.mount2 + slower.mount2), floor, 2)
@@ -243,11 +253,11 @@ class TimeOffset:
         """(R,) of the velocity that images show at the most probable offset. Zero where nothing measures how the
         vehicle's changed."""
         change_mps = None
-        if before is not None and since_s < MAX_GAP_S:
-            change_mps = telemetry.velocity_changes(before.middle_ns, now.middle_ns, GRID_S)
+        if before is not None and since_s < MAX_VELOCITY_GAP_S:
+            change_mps = telemetry.velocity_changes(before.middle_ns, now.middle_ns, DRIFT_GRID_S)
         if change_mps is None:
             self._rate.forget()
-            change_mps = np.zeros(len(GRID_S))
+            change_mps = np.zeros(len(DRIFT_GRID_S))
         at, rates = int(np.argmax(self._mass.sum(axis=0))), self._mass.sum(axis=1)
         moved_m, change = complex(now.mean[at]) * now.span_s * agl_m, complex(change_mps[at])
         noise_m2 = (CORRELATED * self._noise[1] + now.mount2[at]) * (now.span_s * agl_m) ** 2
@@ -256,7 +266,7 @@ class TimeOffset:
 
     def _levelled(self, view: _View, telemetry: Telemetry) -> _Levelled | None:
         """None where attitudes do not cover the grid."""
-        shift_ns = np.round(GRID_S * 1e9).astype(np.int64)
+        shift_ns = np.round(DRIFT_GRID_S * 1e9).astype(np.int64)
         points, tilt = [], np.zeros(0)
         for t_ns, xy in ((view.keyframe_ns, view.pairs[:, :2]), (view.t_ns, view.pairs[:, 2:])):
             attitudes = telemetry.attitudes_about(t_ns - shift_ns)
@@ -264,7 +274,7 @@ class TimeOffset:
                 return None
             r_w_b, tilt = attitudes
             rays = r_w_b @ self._r_b_c @ np.column_stack([xy, np.ones(len(xy))]).T  # (L, 3, N)
-            points.append((rays[:, 0] + 1j * rays[:, 1]) / np.maximum(-rays[:, 2], MIN_DOWN))
+            points.append((rays[:, 0] + 1j * rays[:, 1]) / np.maximum(-rays[:, 2], MIN_RAY_DOWN))
         keyframe, frame = points
         from_mean, to_mean = frame - frame.mean(1, keepdims=True), keyframe - keyframe.mean(1, keepdims=True)
         ratio = (from_mean.conj() * to_mean).sum(1) / np.maximum((np.abs(from_mean) ** 2).sum(1), 1e-12)
@@ -285,14 +295,14 @@ class TimeOffset:
         likely2 = float(density @ np.clip(np.abs(residual) ** 2 - mount2, 0.0, GATE[2] * self._noise[kind]))
         self._noise[kind] += (likely2 - self._noise[kind]) / NOISE_MEMORY
         shrunk2 = np.abs(mean + gain * (residual - mean)) ** 2
-        return np.asarray(-0.5 * INDEPENDENT_SHARE * axes * (shrunk2 / variance + np.log(variance)))
+        return np.asarray(-0.5 * INDEPENDENT_COMPARISON_SHARE * axes * (shrunk2 / variance + np.log(variance)))
 
 
 def _prior(sigma_s: float) -> np.ndarray:
     """(R, L) mass of a constant offset with ``sigma_s`` about 0, and of some share anywhere."""
-    mass = np.zeros((len(RATES), len(GRID_S)))
-    stamped = np.exp(-0.5 * (GRID_S / sigma_s) ** 2)
-    mass[0] = (1.0 - UNSTAMPED_SHARE) * stamped / stamped.sum() + UNSTAMPED_SHARE / len(GRID_S)
+    mass = np.zeros((len(RATES), len(DRIFT_GRID_S)))
+    stamped = np.exp(-0.5 * (DRIFT_GRID_S / sigma_s) ** 2)
+    mass[0] = (1.0 - UNSTAMPED_SHARE) * stamped / stamped.sum() + UNSTAMPED_SHARE / len(DRIFT_GRID_S)
     return mass
 
 
@@ -300,7 +310,7 @@ def _jump(before: _Velocity, now: _Velocity, agl_m: float, telemetry: Telemetry)
     """-> (L,) complex, change of velocity that inertial readings do not explain [heights/s], over the root of two, and
     its least variance on each axis."""
     between_s = (now.middle_ns - before.middle_ns) * 1e-9
-    change_mps = telemetry.velocity_changes(before.middle_ns, now.middle_ns, GRID_S)
+    change_mps = telemetry.velocity_changes(before.middle_ns, now.middle_ns, DRIFT_GRID_S)
     accel_mps2 = ACCELERATION_SIGMA_MPS2 if change_mps is None else INERTIAL_SIGMA_MPS2
     inertial = 0.0 if change_mps is None else change_mps / agl_m
     tilt = MIN_TILT_SIGMA_RAD * float(np.hypot(1.0 / now.span_s, 1.0 / before.span_s))

@@ -15,7 +15,7 @@ BIAS_SIGMA_MPS2, BIAS_S = 0.12, 10.0  # m/s^2, s [spec: 0.7 degrees, attitude_sl
 WHITE_SIGMA_MPS2 = 0.2  # m/s^2 in a span [spec: attitude_sigma_deg]
 # Of a change of velocity: a wrong height scales it as well. With 0.05 turns looked like drifts.
 TURN_SHARE = 0.3  # [measured: docs/decisions/058]
-SIZE = 3  # of a state [spec: below]
+EVIDENCE_SIZE = 3  # of a state [spec: below]
 
 
 class VelocityEvidence:
@@ -24,7 +24,7 @@ class VelocityEvidence:
     def __init__(self) -> None:
         # (R, 3): off the newest position that was seen [m], velocity [m/s], error of inertial readings [m/s^2].
         self._state: np.ndarray | None = None
-        self._cov = np.zeros((len(RATES), SIZE, SIZE))  # on each axis
+        self._cov = np.zeros((len(RATES), EVIDENCE_SIZE, EVIDENCE_SIZE))  # on each axis
 
     def forget(self) -> None:
         self._state = None
@@ -39,7 +39,7 @@ class VelocityEvidence:
         if self._state is None:
             self._state = np.column_stack([np.zeros(rates), moved_m / span_s / SEEN, np.zeros(rates)])
             of_v = np.column_stack([np.ones(rates), 1.0 / (span_s * SEEN)])
-            self._cov = np.zeros((rates, SIZE, SIZE))
+            self._cov = np.zeros((rates, EVIDENCE_SIZE, EVIDENCE_SIZE))
             self._cov[:, :2, :2] = noise_m2 * of_v[:, :, None] * of_v[:, None, :]
             self._cov[:, 1, 1] *= 2.0  # two frames
             self._cov[:, 2, 2] = BIAS_SIGMA_MPS2**2

@@ -16,6 +16,7 @@ import serial
 
 from terrafix.core.errors import LinkError
 
+REOPEN_PERIOD_NS = 1_000_000_000  # between two attempts to open a lost device [tuned]
 CONNECT_TIMEOUT_S = 3.0  # for a TCP peer at start [tuned]
 MAX_READ_BYTES = 65_536  # bytes per read: bounds the share of a tick that a flood of data can take [tuned]
 MAX_DATAGRAMS_PER_READ = 200  # for the same reason [tuned]

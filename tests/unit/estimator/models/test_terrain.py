@@ -18,7 +18,7 @@ from terrafix.estimator.measurements.map_pose import measured_pose
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.plane_motion import Ground
 from terrafix.estimator.models.terrain import Terrain
-from terrafix.estimator.models.terrain_roughness import CANDIDATES, PRIOR
+from terrafix.estimator.models.terrain_roughness import PRIOR, ROUGHNESS_CANDIDATES
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.state import CALIBRATION_SIZE
 from terrafix.messages import (
@@ -33,7 +33,7 @@ from terrafix.messages import (
     Verdict,
 )
 
-RISE = float(np.sqrt(PRIOR @ CANDIDATES**2))  # prior
+RISE = float(np.sqrt(PRIOR @ ROUGHNESS_CANDIDATES**2))  # prior
 
 ORIGIN = Origin(
     t_ns=0,
