@@ -289,7 +289,7 @@ class FrameTracker:
         return two_view, SIGMA_PX / self._camera.fx / float(np.sqrt(inliers / tracked))
 
     def _reject(self, keyframe: _Keyframe, current: _Keyframe, tracked: int) -> Motion:
-        """Registration failed. Starts a new fragment after MAX_TRACK_FAILURES failures, or when the keyframe is too old."""
+        """Registration failed. Starts a new fragment after MAX_TRACK_FAILURES, or when the keyframe is too old."""
         self._failures += 1
         if self._failures >= MAX_TRACK_FAILURES or keyframe.age >= MAX_KEYFRAME_AGE:
             return replace(self._new_fragment(current.frame_id, current.gray, current.view), view=current.view)

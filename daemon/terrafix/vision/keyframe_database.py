@@ -41,7 +41,6 @@ class _Places:
     def __init__(self, count: int) -> None:
         self._xy_px = np.full((count, COARSE_FEATURES, 2), 0.0, np.float32)
         self._descriptors = np.full((count, COARSE_FEATURES, DESCRIPTOR_SIZE), 0, np.uint8)
-        self._angle_rad = np.full((count, COARSE_FEATURES), 0.0, np.float32)
         self._size_px = np.full((count, COARSE_FEATURES), 0.0, np.float32)
         self._histograms = np.full((count, WORDS), 0.0, np.float32)
         self._free = list(range(count))
@@ -49,23 +48,16 @@ class _Places:
 
     @property
     def size_bytes(self) -> int:
-        arrays = (self._xy_px, self._descriptors, self._angle_rad, self._size_px, self._histograms)
-        return sum(a.nbytes for a in arrays)
+        return sum(a.nbytes for a in (self._xy_px, self._descriptors, self._size_px, self._histograms))
 
     def put(self, frame_id: int, features: Features) -> tuple[Features, np.ndarray]:
         """-> the features as they are stored, the strongest COARSE_FEATURES, and a histogram of zeros. A place must be
         free."""
         place = self._of[frame_id] = self._free.pop()
         count = min(len(features), COARSE_FEATURES)
-        stored = Features(
-            self._xy_px[place, :count],
-            self._descriptors[place, :count],
-            self._angle_rad[place, :count],
-            self._size_px[place, :count],
-        )
+        stored = Features(self._xy_px[place, :count], self._descriptors[place, :count], self._size_px[place, :count])
         stored.xy_px[:] = features.xy_px[:count]
         stored.descriptors[:] = features.descriptors[:count]
-        stored.angle_rad[:] = features.angle_rad[:count]
         stored.size_px[:] = features.size_px[:count]
         self._histograms[place] = 0.0
         return stored, self._histograms[place]

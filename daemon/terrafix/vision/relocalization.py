@@ -151,4 +151,4 @@ def _oldest(verified: list[tuple[StoredKeyframe, TwoView]]) -> tuple[StoredKeyfr
 
 
 def _unpacked(features: Features) -> Features:
-    return Features(features.xy_px, features.descriptors.astype(np.float32), features.angle_rad, features.size_px)
+    return Features(features.xy_px, features.descriptors.astype(np.float32), features.size_px)
