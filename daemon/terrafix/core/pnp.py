@@ -183,14 +183,7 @@ def _refine(
         return None, inlier
     cutoff = POSE_CUTOFF * given.threshold
     fit = fit_pose(
-        points,
-        xy,
-        first.r_w_c,
-        first.p_c_in_w_m,
-        given.sigma_floor,
-        weights,
-        INDEPENDENT_MATCH_SHARE,
-        cutoff=cutoff,
+        points, xy, first.r_w_c, first.p_c_in_w_m, given.sigma_floor, weights, INDEPENDENT_MATCH_SHARE, cutoff=cutoff
     )
     if fit is None:
         return None, inlier

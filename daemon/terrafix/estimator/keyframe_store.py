@@ -17,12 +17,7 @@ from terrafix.estimator.state import POSE_SIZE
 MAX_STORED_KEYFRAMES = 10_000
 
 _ROW = np.dtype(
-    [
-        ("rotation", float, (3, 3)),
-        ("p_m", float, (3,)),
-        ("cov", float, (POSE_SIZE, POSE_SIZE)),
-        ("ground_m", float),
-    ]
+    [("rotation", float, (3, 3)), ("p_m", float, (3,)), ("cov", float, (POSE_SIZE, POSE_SIZE)), ("ground_m", float)]
 )
 
 

@@ -15,13 +15,7 @@ from terrafix.core.gate import GATE
 from terrafix.core.pose import TRANSLATION
 from terrafix.smoother.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
 from terrafix.smoother.sim3_consensus import Similarity, place
-from terrafix.smoother.submap_types import (
-    AbsoluteConstraint,
-    MergedSubmaps,
-    RelativeConstraint,
-    Submap,
-    SubmapPose,
-)
+from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, RelativeConstraint, Submap, SubmapPose
 
 # Precisions of a weak prior on every submap, which keeps the system solvable without inliers: sigmas of 10 rad, 1 km,
 # and e^3 of the scale.

@@ -212,13 +212,7 @@ class FrameTracker:
         return index[inlier], positions[inlier], int(keep.sum())
 
     def _accept_tracks(
-        self,
-        keyframe: _Keyframe,
-        frame_id: int,
-        gray: np.ndarray,
-        index: np.ndarray,
-        points: np.ndarray,
-        tracked: int,
+        self, keyframe: _Keyframe, frame_id: int, gray: np.ndarray, index: np.ndarray, points: np.ndarray, tracked: int
     ) -> Motion:
         """``points`` (N, 2) px: tracked positions of the keyframe's corners ``index`` (N,)."""
         corners = keyframe.corners[index]

@@ -365,12 +365,7 @@ class FrameMatcher:
     def _extent(self, frame: Rectified) -> tuple[float, float, float, float]:
         """Extent of a rectified frame relative to the nadir, metres: e_min, n_max, e_max, n_min."""
         h, w = frame.mask.shape
-        return (
-            frame.e_min_m,
-            frame.n_max_m,
-            frame.e_min_m + w * frame.gsd_m,
-            frame.n_max_m - h * frame.gsd_m,
-        )
+        return (frame.e_min_m, frame.n_max_m, frame.e_min_m + w * frame.gsd_m, frame.n_max_m - h * frame.gsd_m)
 
 
 def view_at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:

@@ -18,15 +18,7 @@ from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.linearization_cache import custom_factor
 from terrafix.estimator.factors.noise import MIN_HEIGHT_M
 from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS
-from terrafix.estimator.state import (
-    CALIBRATION_SIZE,
-    HEIGHT,
-    POSE_SIZE,
-    RADIAL_K1,
-    ROTATION,
-    TRANSLATION,
-    UP,
-)
+from terrafix.estimator.state import CALIBRATION_SIZE, HEIGHT, POSE_SIZE, RADIAL_K1, ROTATION, TRANSLATION, UP
 
 MIN_FACTOR_TRIPLES = 12  # points [tuned]
 # A focal length error is equal in all images: n errors of one sigma add up to n sigmas, not to the root of n as

@@ -12,15 +12,7 @@ from terrafix.core.camera import Mount
 from terrafix.estimator.integrity.turn_comparison import Turn, TurnComparison
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.monitors.visual_motion import image_turn
-from terrafix.messages import (
-    Camera,
-    CameraVehicle,
-    CandidateAttitude,
-    Odometry,
-    ServedVehicle,
-    VehicleState,
-    Verdict,
-)
+from terrafix.messages import Camera, CameraVehicle, CandidateAttitude, Odometry, ServedVehicle, VehicleState, Verdict
 
 # Only what turns is compared: straight flight is the same for all.
 TURN_SPAN_NS = 500_000_000  # shortest time over which turns between frames are summed [measured: docs/decisions/052]

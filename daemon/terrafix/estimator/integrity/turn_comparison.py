@@ -10,11 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.estimator.integrity.offset_drift import STEP_S
-from terrafix.estimator.integrity.time_offset import (
-    INDEPENDENT_COMPARISON_SHARE,
-    REPORT_WAIT_NS,
-    UNSTAMPED_SHARE,
-)
+from terrafix.estimator.integrity.time_offset import INDEPENDENT_COMPARISON_SHARE, REPORT_WAIT_NS, UNSTAMPED_SHARE
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import STAMP_SIGMA_S
 

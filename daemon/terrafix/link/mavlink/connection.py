@@ -26,12 +26,7 @@ class Connection:
     reopen."""
 
     def __init__(
-        self,
-        config: LinkSection,
-        transport: Transport | None,
-        wall_clock_ns: Callable[[], int],
-        *,
-        link_id: int = 0,
+        self, config: LinkSection, transport: Transport | None, wall_clock_ns: Callable[[], int], *, link_id: int = 0
     ) -> None:
         """``transport`` None: ``messages`` opens it. ``link_id``: link id of the signatures, one for each connection.
 
