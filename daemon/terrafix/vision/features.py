@@ -51,13 +51,11 @@ class Matches:
 class FeatureMatcher(Protocol):
     def describe(self, gray: np.ndarray) -> Features:
         """(H, W) uint8 -> its features."""
-        ...
 
     def match(self, first: Features, second: Features) -> Matches: ...
 
     def shared(self, first: Features, second: Features) -> int:
         """Number of matches, by the fastest method: which images are worth to be matched."""
-        ...
 
 
 class SiftMatcher:

@@ -1,13 +1,15 @@
 """Every constant of estimator, anchor and link says where it comes from, the number of chosen ones only falls, and a
 name of a constant has one value in all that flies."""
 
-import ast
+import re
 from collections import Counter, defaultdict
 
-from constants_ledger import CONSTANT, ROOT, constants
+from constants_ledger import ROOT, constants
 
 MAX_TUNED = 460  # lower it when a constant gets a measurement or a specification; never raise it
 TERRAFIX = ROOT / "daemon" / "terrafix"
+NAME = r"_?[A-Z][A-Z0-9_]+"
+ASSIGNED = re.compile(rf"^({NAME}(?:, {NAME})*)(?:: [^=\n]+)? = ", re.MULTILINE)  # at the top of a module
 
 
 def test_every_constant_has_a_source() -> None:
@@ -25,18 +27,8 @@ def test_the_name_of_a_constant_has_one_value() -> None:
     """A name that two files define is two facts, which say whose they are, or one fact, which one file imports."""
     files = defaultdict(set)
     for path in TERRAFIX.rglob("*.py"):
-        for name in _constant_names(ast.parse(path.read_text("utf-8"))):
-            files[name].add(str(path.relative_to(TERRAFIX)))
+        for names in ASSIGNED.findall(path.read_text("utf-8")):
+            for name in names.split(", "):
+                files[name].add(str(path.relative_to(TERRAFIX)))
     several = {name: sorted(where) for name, where in files.items() if len(where) > 1}
-    assert not several, f"name the owner in each, or import the one: {several}"
-
-
-def _constant_names(module: ast.Module) -> set[str]:
-    targets = []
-    for node in module.body:
-        if isinstance(node, ast.Assign):
-            targets += node.targets
-        elif isinstance(node, ast.AnnAssign):
-            targets.append(node.target)
-    names = [n for t in targets for n in (t.elts if isinstance(t, ast.Tuple) else [t]) if isinstance(n, ast.Name)]
-    return {name.id for name in names if CONSTANT.match(name.id) and len(name.id) > 1}
+    assert files and not several, f"name the owner in each, or import the one: {several}"

@@ -37,7 +37,6 @@ class Describer(Protocol):
 
     def describe(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR -> (C, H // stride, W // stride) float32"""
-        ...
 
 
 class MapFeatures:

@@ -14,7 +14,7 @@ from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, De
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, patch_centres, rectify
-from terrafix.anchor.matching.patch_matcher import match_patches
+from terrafix.anchor.matching.patch_matcher import SearchedMap, match_patches
 from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_SLOPE, BELIEF_LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
@@ -331,11 +331,10 @@ class FrameMatcher:
         e_min, n_max = view.e_m + frame.e_min_m - margin, view.n_m + frame.n_max_m + margin
         width, height = mask.shape[1] + 2 * radius + 4, mask.shape[0] + 2 * radius + 4
         features = self.gradient_features if describer is self.gradients else self._features
-        window, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
+        cells, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
+        searched = SearchedMap(cells, valid, (e_min, n_max))
         centres = patch_centres(self.camera, view.r_w_c, view.agl_m, frame, cell, PATCH_STEP)
-        found = match_patches(
-            template, frame, mask, cell, window, valid, (e_min, n_max), (view.e_m, view.n_m), patch, radius, centres
-        )
+        found = match_patches(template, frame, mask, cell, searched, (view.e_m, view.n_m), patch, radius, centres)
         rays = np.column_stack([found.frame_m, np.full(len(found.frame_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
         up = self._map.elevation(found.map_m[:, 0], found.map_m[:, 1]) if len(xy) else None

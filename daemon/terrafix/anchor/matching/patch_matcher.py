@@ -35,28 +35,36 @@ class PatchMatches:
     weight: np.ndarray
 
 
+@dataclass(frozen=True)
+class SearchedMap:
+    """``cells`` (C, H, W) and ``valid`` (H, W) describe the map from its corner ``corner_m`` (e_min, n_max) on."""
+
+    cells: np.ndarray
+    valid: np.ndarray
+    corner_m: tuple[float, float]
+
+
 def match_patches(
     template: np.ndarray,
     rectified: Rectified,
     cells_mask: np.ndarray,
     cell_m: float,
-    window: np.ndarray,
-    valid: np.ndarray,
-    window_corner_m: tuple[float, float],
+    searched: SearchedMap,
     camera_m: tuple[float, float],
     patch_cells: int,
     radius_cells: int,
     centres: np.ndarray | None = None,
 ) -> PatchMatches:
-    """``template`` (C, h, w) and ``cells_mask`` (h, w) describe the rectified frame; ``window`` (C, H, W) and ``valid``
-    (H, W) the map, with its corner at (e_min, n_max). ``camera_m``: predicted east and north of the camera. Each patch
-    is searched within ``radius_cells`` of its predicted place. ``centres``: as in ``correlate_patches``."""
+    """``template`` (C, h, w) and ``cells_mask`` (h, w) describe the rectified frame. ``camera_m``: predicted east and
+    north of the camera. Each patch is searched within ``radius_cells`` of its predicted place. ``centres``: as in
+    ``correlate_patches``."""
     # Cell of the window at which the template's corner is expected.
-    row0_exact = (window_corner_m[1] - (camera_m[1] + rectified.n_max_m)) / cell_m
-    column0_exact = ((camera_m[0] + rectified.e_min_m) - window_corner_m[0]) / cell_m
+    e_min_m, n_max_m = searched.corner_m
+    row0_exact = (n_max_m - (camera_m[1] + rectified.n_max_m)) / cell_m
+    column0_exact = ((camera_m[0] + rectified.e_min_m) - e_min_m) / cell_m
     row0, column0 = round(row0_exact), round(column0_exact)
     corners, shares, surfaces = correlate_patches(
-        template, cells_mask, window, valid, patch_cells, radius_cells, row0, column0, centres
+        template, cells_mask, searched.cells, searched.valid, patch_cells, radius_cells, row0, column0, centres
     )
     peaks = _peaks(surfaces, np.array([row0_exact - row0, column0_exact - column0]))
     half = patch_cells / 2.0
@@ -64,7 +72,7 @@ def match_patches(
     found = places + np.array([row0, column0]) - radius_cells + peaks.place
     return PatchMatches(
         np.column_stack([rectified.e_min_m + places[:, 1] * cell_m, rectified.n_max_m - places[:, 0] * cell_m]),
-        np.column_stack([window_corner_m[0] + found[:, 1] * cell_m, window_corner_m[1] - found[:, 0] * cell_m]),
+        np.column_stack([e_min_m + found[:, 1] * cell_m, n_max_m - found[:, 0] * cell_m]),
         peaks.weight * shares[peaks.index],
     )
 

@@ -32,13 +32,11 @@ Chunk = tuple[bytes, Address | None]  # with the sender on a listening port; Non
 class Transport(Protocol):
     def read(self) -> list[Chunk]:
         """-> received data in order; empty when there is none."""
-        ...
 
     def write(self, packet: bytes, to: Address | None = None) -> bool:
         """``to``: one peer of a listening port; None: all of its peers, or the only other end.
 
         -> False if the buffer is full or there is no peer. The packet is then lost; it is not sent later."""
-        ...
 
     def close(self) -> None: ...
 

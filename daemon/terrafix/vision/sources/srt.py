@@ -11,10 +11,12 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import VehicleState
 from terrafix.vision.sources.xmp import body_angles_from_gimbal
 
-_VALUE = r"([-+]?\d+(?:\.\d+)?)"
+_FIELD_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{3})\s*-->")
-_HEIGHT_FORMS = tuple(re.compile(form + _VALUE) for form in (r"rel_alt\s*:\s*", r"BAROMETER\s*[:(]\s*", r"\bH\s+"))
-_ANGLE_FORMS = tuple(re.compile(rf"gb_{axis}\s*:\s*{_VALUE}") for axis in ("yaw", "pitch", "roll"))
+_HEIGHT_FORMS = tuple(
+    re.compile(form + _FIELD_NUMBER) for form in (r"rel_alt\s*:\s*", r"BAROMETER\s*[:(]\s*", r"\bH\s+")
+)
+_ANGLE_FORMS = tuple(re.compile(rf"gb_{axis}\s*:\s*{_FIELD_NUMBER}") for axis in ("yaw", "pitch", "roll"))
 
 
 def read_srt(path: Path) -> list[VehicleState]:
