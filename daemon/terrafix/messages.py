@@ -664,6 +664,9 @@ class Refinement(Message, frozen=True, kw_only=True):
     source: RefinementSource = RefinementSource.FLIGHT
 
 
+NO_FRAME_ID = -1  # frame_id of a verdict that belongs to no frame
+
+
 class MeasurementVerdict(Message, frozen=True, kw_only=True):
     """Result of the checks of one measurement. Every rejection has one (law 3); of heights and headings only those."""
 
@@ -686,6 +689,9 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
 
 
 # --- link -----------------------------------------------------------------------------------------
+
+
+NO_FIX, FIX_2D, FIX_3D = 1, 2, 3  # GPS_FIX_TYPE of MAVLink's common.xml
 
 
 class GpsInput(Message, frozen=True, kw_only=True):

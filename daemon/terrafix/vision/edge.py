@@ -22,7 +22,7 @@ from terrafix.vision.sources import Shot, Source, open_configured
 
 QUEUE_SHOTS = 3  # shots with pixels that are read ahead from a recording that is not played in real time
 MAX_DROPPED_MESSAGES = 1024  # dropped frames and their telemetry, without pixels; 20 s at 50 Hz
-MAX_LATE_NS = 2_000_000_000  # a recording that lags real time by more than this skips ahead
+MAX_LAG_NS = 2_000_000_000  # a recording that lags real time by more than this skips ahead
 
 
 class SourceEdge:
@@ -121,7 +121,7 @@ class SourceEdge:
             timed = self._to_system_time(shot)
             if self._realtime and not self._source.live:
                 late_ns = now_ns() - timed.frame.t_ns
-                if late_ns > MAX_LATE_NS and index > 0:  # the first shot is always published, to guarantee progress
+                if late_ns > MAX_LAG_NS and index > 0:  # the first shot is always published, to guarantee progress
                     return now_ns() - self._zero_ns
                 if late_ns < 0 and self._stopping.wait(-late_ns / 1e9):
                     return -1

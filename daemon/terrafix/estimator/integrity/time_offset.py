@@ -16,7 +16,7 @@ import numpy as np
 
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.core.pose import log_so3
-from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, RESOLUTION_S2, Hazards, predicted, transitions
+from terrafix.estimator.integrity.offset_drift import DRIFT_GRID_S, RATES, RESOLUTION_S2, Hazards, predicted, transitions
 from terrafix.estimator.integrity.velocity_evidence import (
     DEGREES_OF_FREEDOM,
     FIRST_GUESS,
@@ -24,7 +24,7 @@ from terrafix.estimator.integrity.velocity_evidence import (
     VelocityEvidence,
 )
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
-from terrafix.estimator.models.plane_motion import MIN_PAIRS, Ground, relative_pose
+from terrafix.estimator.models.plane_motion import , Ground, relative_pose
 from terrafix.messages import STAMP_SIGMA_S, CalibrationFault, Frame, Odometry, Verdict
 
 FAR_S = 3.0 * STAMP_SIGMA_S  # s: a larger offset is not that of transfer alone [spec: three sigmas]
@@ -38,7 +38,7 @@ BUFFERED, STAMPED = Hazards(3.0 / 3600.0, 0.2 / 3600.0), Hazards(1.0 / 3.6e6, 1.
 MIN_SPAN_NS = 900_000_000  # [measured: docs/decisions/058]
 # 1-sigma of a rotation between two frames, about each axis: first guess with gyroscopes, and by two attitudes; lower
 # limit. [measured: docs/decisions/058; spec: root of two times the attitude of a cheap autopilot; tuned]
-GYRO_SIGMA_RAD, ATTITUDE_SIGMA_RAD, MIN_TURN_SIGMA_RAD = np.radians(0.3), np.radians(1.5), np.radians(0.1)
+GYRO_SIGMA_RAD, ATTITUDE_SIGMA_RAD, MIN_OFFSET_TURN_SIGMA_RAD = np.radians(0.3), np.radians(1.5), np.radians(0.1)
 # 1-sigma of the mount's tilt, by which a turn looks like a roll [spec: twice that of turn_comparison.py]
 MOUNT_SIGMA_RAD = np.radians(3.0)
 # The images alone determine the tilt between two frames: the attitude only selects one of two mirror solutions.
@@ -46,7 +46,7 @@ TILT_SIGMA_RAD = np.radians(10.0)  # [spec: beyond the lean of a vehicle within 
 HEIGHT_SHARE = 0.1  # 1-sigma of the height, share of it: rotations do not depend on it [tuned]
 # Least share of the noise that the images have. Without a limit two of three healthy flights had a false offset.
 MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
-MAX_GAP_S = 2.0  # s between two velocities that are compared [spec: the slowest camera, a frame in two seconds]
+MAX_VELOCITY_GAP_S = 2.0  # s between two velocities that are compared [spec: the slowest camera, a frame in two seconds]
 MAX_NATS = 6.0  # of one comparison: twice MAX_STEP of the monitors [spec: monitors/cusum.py]
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
 APPLY_MAX_SIGMA_S = 0.25  # s: largest 1-sigma of an offset that is applied [tuned]
@@ -123,10 +123,10 @@ class TimeOffset:
         self._stamps_ns[odometry.frame_id] = self._newest_ns = odometry.t_ns
         self._density = None
         keyframe_ns = self._stamps_ns.get(odometry.keyframe_id)
-        seen = odometry.verdict is Verdict.ACCEPTED and len(odometry.two_view) >= MIN_PAIRS
+        seen = odometry.verdict is Verdict.ACCEPTED and len(odometry.two_view) >= 
         if seen and keyframe_ns is not None and keyframe_ns < odometry.t_ns:
             self._pending.append((odometry, keyframe_ns, max(agl_m, 1.0)))
-        reach_ns = round(-GRID_S[0] * 1e9) + REPORT_WAIT_NS
+        reach_ns = round(-DRIFT_GRID_S[0] * 1e9) + REPORT_WAIT_NS
         while self._pending and self._pending[0][0].t_ns + reach_ns <= telemetry.newest_turn_ns:
             self._compare(*self._pending.popleft(), telemetry)
         while self._pending and self._pending[0][0].t_ns + 2 * reach_ns < odometry.t_ns:  # no attitude is reported
@@ -134,7 +134,7 @@ class TimeOffset:
 
     @property
     def density(self) -> np.ndarray:
-        """Probabilities over ``GRID_S`` at the newest frame."""
+        """Probabilities over ``DRIFT_GRID_S`` at the newest frame."""
         if self._density is None:
             since_s = 0.0 if self._at_ns is None else (self._newest_ns - self._at_ns) * 1e-9
             self._density = predicted(self._mass, since_s, self._hazards).sum(axis=0)
@@ -143,7 +143,7 @@ class TimeOffset:
     @property
     def estimate(self) -> tuple[float, float]:
         """Mean and 1-sigma of the density [s]."""
-        mean_s = float(self.density @ GRID_S)
+        mean_s = float(self.density @ DRIFT_GRID_S)
         return mean_s, self._sigma_about(mean_s)
 
     @property
@@ -196,10 +196,10 @@ class TimeOffset:
 
     def _far(self, from_s: float) -> float:
         """Probability of an offset that is not within FAR_S of ``from_s``."""
-        return float(self.density[np.abs(GRID_S - from_s) > FAR_S].sum())
+        return float(self.density[np.abs(DRIFT_GRID_S - from_s) > FAR_S].sum())
 
     def _sigma_about(self, from_s: float) -> float:
-        return float(np.sqrt(self.density @ (GRID_S - from_s) ** 2 + RESOLUTION_S2))
+        return float(np.sqrt(self.density @ (DRIFT_GRID_S - from_s) ** 2 + RESOLUTION_S2))
 
     def _compare(self, odometry: Odometry, keyframe_ns: int, agl_m: float, telemetry: Telemetry) -> None:
         now = self._registered(odometry, keyframe_ns, agl_m, telemetry)
@@ -208,7 +208,7 @@ class TimeOffset:
             return
         if self._before is None or odometry.keyframe_id not in self._chain:  # another fragment
             self._rate.forget()
-            self._before = _Registered(keyframe_ns, 0j, np.zeros(3), np.zeros((len(GRID_S), 3)))
+            self._before = _Registered(keyframe_ns, 0j, np.zeros(3), np.zeros((len(DRIFT_GRID_S), 3)))
             self._chain = {odometry.keyframe_id: self._before}
         before, now = self._before, now.after(self._chain[odometry.keyframe_id])
         self._chain = {frame: one for frame, one in self._chain.items() if frame >= odometry.keyframe_id}
@@ -229,7 +229,7 @@ class TimeOffset:
     ) -> _Registered | None:
         """The frame relative to its keyframe. None where attitudes do not cover the grid, or the images do not
         determine the rotation."""
-        shift_ns = np.round(GRID_S * 1e9).astype(np.int64)
+        shift_ns = np.round(DRIFT_GRID_S * 1e9).astype(np.int64)
         ends = (telemetry.attitudes_about(t_ns - shift_ns) for t_ns in (keyframe_ns, odometry.t_ns))
         bodies = [r_w_b for r_w_b in ends if r_w_b is not None]
         if len(bodies) < 2:
@@ -241,7 +241,7 @@ class TimeOffset:
         if motion is None:
             return None
         turned_rad, moved_m = cameras[0] @ log_so3(motion.r), cameras[0] @ motion.p_m
-        by_gyro = telemetry.turns_by_gyro(keyframe_ns, odometry.t_ns, GRID_S)
+        by_gyro = telemetry.turns_by_gyro(keyframe_ns, odometry.t_ns, DRIFT_GRID_S)
         reported_rad = _rotations(bodies[0], bodies[1]) if by_gyro is None else by_gyro
         apart_rad = turned_rad - reported_rad
         return _Registered(odometry.t_ns, complex(*moved_m[:2]), turned_rad, apart_rad, by_gyro is not None)
@@ -255,7 +255,7 @@ class TimeOffset:
         residual = now.apart_rad - before.apart_rad - self._gyro_bias * span_s  # (L, 3)
         mount2 = MOUNT_SIGMA_RAD**2 * (turned_rad @ turned_rad - turned_rad**2)  # about the other two axes
         learnt, density, mean = self._noise[now.by_gyro], self._mass.sum(axis=0), residual.mean(0)
-        noise = np.maximum(learnt, MIN_TURN_SIGMA_RAD**2)
+        noise = np.maximum(learnt, MIN_OFFSET_TURN_SIGMA_RAD**2)
         gain = np.maximum(0.0, 1.0 - noise / np.maximum(np.mean((residual - mean) ** 2, axis=0), 1e-12))
         variance = np.maximum(gain, MIN_NOISE_SHARE) * noise + mount2
         likely2 = density @ np.clip(residual**2 - mount2, 0.0, GATE[2] * learnt)
@@ -272,8 +272,8 @@ class TimeOffset:
         """(R,) of the displacement that images show. Zero where nothing measures how the
         vehicle's velocity changed."""
         span_s, changes = (now.t_ns - before.t_ns) * 1e-9, None
-        if since_s < MAX_GAP_S:
-            changes = telemetry.velocity_changes(before.t_ns, now.t_ns, GRID_S)
+        if since_s < MAX_VELOCITY_GAP_S:
+            changes = telemetry.velocity_changes(before.t_ns, now.t_ns, DRIFT_GRID_S)
         if changes is None:
             self._rate.forget()
             return np.zeros(len(RATES))
@@ -286,9 +286,9 @@ class TimeOffset:
 
 def _prior(sigma_s: float) -> np.ndarray:
     """(R, L) mass of a constant offset with ``sigma_s`` about 0, and of some share anywhere."""
-    mass = np.zeros((len(RATES), len(GRID_S)))
-    stamped = np.exp(-0.5 * (GRID_S / sigma_s) ** 2)
-    mass[0] = (1.0 - UNSTAMPED_SHARE) * stamped / stamped.sum() + UNSTAMPED_SHARE / len(GRID_S)
+    mass = np.zeros((len(RATES), len(DRIFT_GRID_S)))
+    stamped = np.exp(-0.5 * (DRIFT_GRID_S / sigma_s) ** 2)
+    mass[0] = (1.0 - UNSTAMPED_SHARE) * stamped / stamped.sum() + UNSTAMPED_SHARE / len(DRIFT_GRID_S)
     return mass
 
 

@@ -19,10 +19,12 @@ SIGMA_SHARE, MIN_SIGMA_SHARE = 0.004, 0.001
 NOISE_MEMORY, FIRST_GUESS = 250.0, 20.0
 # Of a change of velocity: a wrong height scales it as well. With 0.05 turns looked like drifts.
 TURN_SHARE = 0.3  # [measured: docs/decisions/058]
-INDEPENDENT_SHARE = 0.5  # of the displacements: two consecutive ones share a frame and a keyframe [spec: 1 / 2]
+INDEPENDENT_DISPLACEMENT_SHARE = (
+    0.5  # of the displacements: two consecutive ones share a frame and a keyframe [spec: 1 / 2]
+)
 # Of Student's t: odometry with an outlier that its residuals do not show is little evidence.
 DEGREES_OF_FREEDOM = 5.0  # [measured: docs/decisions/058]
-SIZE = 3  # of a state [spec: below]
+EVIDENCE_SIZE = 3  # of a state [spec: below]
 
 
 class VelocityEvidence:
@@ -31,7 +33,7 @@ class VelocityEvidence:
     def __init__(self) -> None:
         # (R, 3): off the newest position that was seen [m], velocity [m/s], error of inertial readings [m/s^2].
         self._state: np.ndarray | None = None
-        self._cov = np.zeros((len(RATES), SIZE, SIZE))  # on each axis
+        self._cov = np.zeros((len(RATES), EVIDENCE_SIZE, EVIDENCE_SIZE))  # on each axis
         self._noise = SIGMA_SHARE**2  # variance of a position on each axis [heights^2]
         self._updates = FIRST_GUESS  # that it rests on
 
@@ -49,7 +51,7 @@ class VelocityEvidence:
         if self._state is None:
             self._state = np.column_stack([np.zeros(rates), moved_m / span_s / SEEN, np.zeros(rates)])
             of_v = np.column_stack([np.ones(rates), 1.0 / (span_s * SEEN)])
-            self._cov = np.zeros((rates, SIZE, SIZE))
+            self._cov = np.zeros((rates, EVIDENCE_SIZE, EVIDENCE_SIZE))
             self._cov[:, :2, :2] = noise_m2 * of_v[:, :, None] * of_v[:, None, :]
             self._cov[:, 1, 1] *= 2.0  # two frames
             self._cov[:, 2, 2] = BIAS_SIGMA_MPS2**2
@@ -78,7 +80,7 @@ class VelocityEvidence:
         state[:, 0] -= moved_m
         self._state, self._cov = state, cov - gain[:, :, None] * cov[:, None, 0, :]
         nu = DEGREES_OF_FREEDOM
-        log = INDEPENDENT_SHARE * (-0.5 * (nu + 2.0) * np.log1p(distance2 / nu) - np.log(variance))
+        log = INDEPENDENT_DISPLACEMENT_SHARE * (-0.5 * (nu + 2.0) * np.log1p(distance2 / nu) - np.log(variance))
         # A larger velocity is rather a zoom or a squeezed image than a camera that is ever less late.
         if log[RATES < 0.0].max() > log[0] + 1.0:  # nat: more than noise
             self.forget()

@@ -20,14 +20,13 @@ BUFFER_STATES = 400  # 8 s at 50 Hz [tuned]
 # Two minutes at 25 and 50 Hz, for which a camera may fail; 30 s at 200 Hz.
 BUFFER_ATTITUDES, BUFFER_READINGS = 3000, 6000  # [tuned]
 STANDS_BELOW_M = 10.0  # drift of a barometer before take-off [tuned]
-MAX_GAP_NS = 1_000_000_000  # between a state and a frame [tuned]
+MAX_STATE_GAP_NS = 1_000_000_000  # between a state and a frame [tuned]
 BOX = np.linspace(-1.0, 1.0, 9)  # where reported angles are averaged about a time, in report intervals [tuned]
 REORDER_NS = 200_000_000  # by which states may come out of order [tuned]
 # Between readings, and from the last one to the frame: acceleration is interpolated linearly.
 MAX_READING_GAP_NS = 120_000_000  # [tuned]
-MAX_ATTITUDE_GAP_NS = (
-    260_000_000  # at 4 Hz, ArduPilot's default, a vehicle turns too far between two [spec: ATTITUDE rate]
-)
+# at 4 Hz, ArduPilot's default, a vehicle turns too far between two [spec: ATTITUDE rate]
+MAX_ATTITUDE_GAP_NS = 260_000_000
 
 
 Timed = tuple[np.ndarray, np.ndarray]  # times (N,) [ns], values (3, N)
@@ -55,7 +54,7 @@ class Attitude:
     @property
     def stale(self) -> float:
         """0 to 1: of the way from an attitude of the frame's time to one that is too far from it to be used."""
-        return self.stale_s * 1e9 / MAX_GAP_NS
+        return self.stale_s * 1e9 / MAX_STATE_GAP_NS
 
     @property
     def stands(self) -> bool:
@@ -64,8 +63,8 @@ class Attitude:
 
 
 LEANS_RAD = np.radians(2.0)  # twice the 1-sigma of a reported tilt [spec: attitude_sigma_deg]
-_ANGLES = ("yaw_rad", "pitch_rad", "roll_rad")
-_FIELDS = (*_ANGLES, "agl_m", "armed", "airspeed_mps")
+_ATTITUDE_ANGLES = ("yaw_rad", "pitch_rad", "roll_rad")
+_FIELDS = (*_ATTITUDE_ANGLES, "agl_m", "armed", "airspeed_mps")
 
 
 class Telemetry:
@@ -103,7 +102,7 @@ class Telemetry:
             yaw_rad = float(angles[0])
         elif yaw_rad is not None:
             yaw_rad += float(angles[0])
-        if held is None or held.age_ns > MAX_GAP_NS or self._repeats():
+        if held is None or held.age_ns > MAX_STATE_GAP_NS or self._repeats():
             lost = replace(platform, yaw_rad=yaw_rad, turned_rad=TURN_UNSEEN_RAD, righted_rad=UNKNOWN_ATTITUDE_RAD)
             pitches, rolls = (axis not in self.gimbal.stabilised for axis in ("pitch", "roll"))
             if not (pitches or rolls):
@@ -131,8 +130,8 @@ class Telemetry:
         unsettled = list(_FIELDS)
         for state in reversed(self._states):
             away_ns = abs(state.t_ns - t_ns)
-            if away_ns > MAX_GAP_NS:
-                if state.t_ns < t_ns - 2 * MAX_GAP_NS:
+            if away_ns > MAX_STATE_GAP_NS:
+                if state.t_ns < t_ns - 2 * MAX_STATE_GAP_NS:
                     break  # they come in order of time, but for REORDER_NS
                 continue
             for name in unsettled.copy():
@@ -144,7 +143,7 @@ class Telemetry:
             if not unsettled:
                 break
         nearest = {name: value for name, (_, value) in best.items()}
-        away_ns = max((best[name][0] for name in _ANGLES if name in best), default=0)
+        away_ns = max((best[name][0] for name in _ATTITUDE_ANGLES if name in best), default=0)
         stale_s = max(0, away_ns - MAX_ATTITUDE_GAP_NS // 2) * 1e-9
         return replace(Attitude(*(nearest.get(name) for name in _FIELDS)), stale_s=stale_s)  # type: ignore[arg-type]
 
@@ -180,7 +179,7 @@ class Telemetry:
     def turned_about(self, t_ns: np.ndarray) -> np.ndarray | None:
         """Reported yaw, pitch and roll (3, N) about times (N,) [ns], unwrapped: means over two report intervals, whose
         noise is the same at a report and between two. None where attitudes do not cover that."""
-        turns = self._turns.around(int(t_ns.min()) - MAX_GAP_NS, int(t_ns.max()) + MAX_GAP_NS)
+        turns = self._turns.around(int(t_ns.min()) - MAX_STATE_GAP_NS, int(t_ns.max()) + MAX_STATE_GAP_NS)
         if turns is None:
             return None
         about_ns = np.median(np.diff(turns[0])) * BOX

@@ -10,7 +10,7 @@ from inertial_flight import InertialFlight
 from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of, t_ns
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
-from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, Hazards, predicted
+from terrafix.estimator.integrity.offset_drift import DRIFT_GRID_S, RATES, Hazards, predicted
 from terrafix.estimator.integrity.time_offset import MAX_SLEW, TimeOffset
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.pose_estimator import EstimatedFlight
@@ -132,7 +132,7 @@ def test_in_straight_flight_a_drift_shows_as_a_velocity_that_changes_without_acc
 
 def test_an_offset_that_nothing_observes_is_claimed_once_its_buffer_may_have_filled() -> None:
     """Of an hour in which a buffer begins to fill once, 5 % are three minutes."""
-    mass = np.zeros((len(RATES), len(GRID_S)))
+    mass = np.zeros((len(RATES), len(DRIFT_GRID_S)))
     mass[0, 40] = 1.0
     hourly = Hazards(1.0 / 3600.0, 0.0)
     away = [1.0 - predicted(mass, 1.0, hourly)[:, 40].sum()]
@@ -170,7 +170,7 @@ class LateCamera(TimeOffset):
 
     @property
     def density(self) -> np.ndarray:
-        return np.where(np.abs(GRID_S - 1.0) < 0.01, 1.0, 0.0)
+        return np.where(np.abs(DRIFT_GRID_S - 1.0) < 0.01, 1.0, 0.0)
 
     def add(self, odometry: Odometry, telemetry: Telemetry, agl_m: float) -> None:
         self.stamps_ns.append(odometry.t_ns)
@@ -202,8 +202,8 @@ class KnownTo(TimeOffset):
     @property
     def density(self) -> np.ndarray:
         one_sigma_s, share = self._known
-        wide = np.exp(-0.5 * (GRID_S / one_sigma_s) ** 2)
-        return share * wide / wide.sum() + (1.0 - share) * (np.abs(GRID_S) < 0.01)
+        wide = np.exp(-0.5 * (DRIFT_GRID_S / one_sigma_s) ** 2)
+        return share * wide / wide.sum() + (1.0 - share) * (np.abs(DRIFT_GRID_S) < 0.01)
 
 
 @pytest.mark.parametrize(("share", "sigma_s"), [(0.01, STAMP_SIGMA_S), (1.0, 0.3)])
