@@ -12,6 +12,7 @@ Conventions
 """
 
 from enum import StrEnum
+from typing import NamedTuple
 
 import msgspec
 from msgspec import UNSET, UnsetType
@@ -138,6 +139,19 @@ class Origin(Message, frozen=True, kw_only=True):
     yaw_sigma_deg: float
     agl_sigma_m: float
     attitude_sigma_deg: float  # of reported roll and pitch
+
+
+class Fact(NamedTuple):
+    topic: str  # "camera", "mount", "start", "height", "heading", "tilt", "clock", "rate", "vehicles", "left out"
+    text: str
+
+
+class SourceFacts(Message, frozen=True, kw_only=True):
+    """What the source says of itself when it is opened: where each number comes from, what is assumed, and what is left
+    out and why. Published after Origin."""
+
+    name: str
+    facts: tuple[Fact, ...]
 
 
 OVERTAKEN = "overtaken: a newer frame was there first"  # error of a frame that was left out, not of the camera
@@ -944,6 +958,7 @@ class LogLine(Message, frozen=True, kw_only=True):
 
 AnyMessage = (
     Origin
+    | SourceFacts
     | Frame
     | VehicleState
     | Imu

@@ -23,7 +23,7 @@ from terrafix.core.initial_position import start_is_unknown, with_map_center
 from terrafix.core.node import Node, NodeContext
 from terrafix.core.passwords import without_password
 from terrafix.map.package import MapPackage
-from terrafix.messages import Message, Origin, SourceEnded
+from terrafix.messages import Message, Origin, SourceEnded, SourceFacts
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import header, versions
 from terrafix.vision.sources import Source, open_configured
@@ -89,12 +89,13 @@ def replay(
     if progress:
         for line in fact_lines(source.name(), facts):
             Console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)
-    with ReplayOutput(out, header(config, package.resolve(), facts), config.recorder) as output:
+    with ReplayOutput(out, header(config, package.resolve()), config.recorder) as output:
         frames = MemoryFrameStore(FRAMES_KEPT)
         ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
         published: list[Message] = []
         shell = InProcessShell(nodes(ctx), lambda _who, message: published.append(message))
-        _feed_flight(source, origin, shell, frames, published, output, watch, progress)
+        said = SourceFacts(t_ns=origin.t_ns, name=source.name(), facts=tuple(facts))
+        _feed_flight(source, origin, said, shell, frames, published, output, watch, progress)
         counts = output.counts()
         if UNMEASURED in counts["verdict"]["cause"] and not isinstance(opened, RecordedFrames):
             counts = output.counts(likely_factor(opened.shots(), origin, package))
@@ -131,6 +132,7 @@ def peak_memory_mb() -> float:
 def _feed_flight(
     source: Source,
     origin: Origin,
+    said: SourceFacts,
     shell: InProcessShell,
     frames: MemoryFrameStore,
     published: list[Message],
@@ -140,6 +142,7 @@ def _feed_flight(
 ) -> None:
     """Feeds the frames one after the other. Recording is outside the measured time: in flight it is another process."""
     shell.feed(origin)
+    shell.feed(said)
     output.take(published)
     watch(published)
     published.clear()

@@ -16,9 +16,10 @@ from terrafix.core.errors import SourceError
 from terrafix.core.frames import FrameWriter
 from terrafix.core.initial_position import Bounds, map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import Edge, NodeContext
-from terrafix.messages import OVERTAKEN, Health, Message, SourceEnded
+from terrafix.messages import OVERTAKEN, Health, Message, SourceEnded, SourceFacts
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_configured
+from terrafix.vision.sources.facts import facts_of
 
 QUEUE_SHOTS = 3  # shots with pixels that are read ahead from a recording that is not played in real time
 MAX_DROPPED_MESSAGES = 1024  # dropped frames and their telemetry, without pixels; 20 s at 50 Hz
@@ -72,7 +73,8 @@ class SourceEdge:
                 self._source.origin() if self._bounds is None else with_map_center(self._source.origin(), self._bounds)
             )
             ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
-            return [msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m)]
+            said = SourceFacts(t_ns=self._zero_ns, name=self._source.name(), facts=tuple(facts_of(self._source)))
+            return [msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m), said]
         ended = self._reading.done()
         with self._changed:
             messages = list(self._dropped)

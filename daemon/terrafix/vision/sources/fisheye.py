@@ -8,9 +8,9 @@ import cv2
 import msgspec
 import numpy as np
 
-from terrafix.messages import Camera, Origin
+from terrafix.messages import Camera, Fact, Origin
 from terrafix.vision.sources.contract import Shot, Source
-from terrafix.vision.sources.facts import Fact, facts_of
+from terrafix.vision.sources.facts import facts_of
 
 # Off the axis; there a pixel sees three times the ground of one in the middle (1 / cos^2) [spec: geometry]
 VIEW_HALF_DEG = 55.0

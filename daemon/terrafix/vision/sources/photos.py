@@ -12,11 +12,11 @@ from itertools import groupby
 from pathlib import Path
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Camera, Frame, Origin, VehicleState
+from terrafix.messages import Camera, Fact, Frame, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import Description, StartTable, camera_of, origin_of, read_description
 from terrafix.vision.sources.exif import PhotoInfo, read_info
-from terrafix.vision.sources.facts import Fact, camera_facts, mount_fact, rate_facts, start_fact, telemetry_facts
+from terrafix.vision.sources.facts import camera_facts, mount_fact, rate_facts, start_fact, telemetry_facts
 from terrafix.vision.sources.images import downscaled_camera, image_files, is_image_name, read_image
 from terrafix.vision.sources.plausible import check_camera, check_heights
 from terrafix.vision.sources.xmp import PIX4D, BodyAngles, Xmp

@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Frame, GimbalAttitude, Imu, Origin, VehicleState
+from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
-from terrafix.vision.sources.facts import Fact, camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
+from terrafix.vision.sources.facts import camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
 from terrafix.vision.sources.srt import read_srt
 from terrafix.vision.sources.table import read_table
 
