@@ -34,6 +34,7 @@ ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.VehicleState,
     m.Imu,
     m.GimbalAttitude,
+    m.Exposure,
     m.SourceEnded,
     m.Odometry,
     m.Relocalization,
@@ -99,6 +100,7 @@ PROCESSES: tuple[Process, ...] = (
             m.VehicleState,
             m.Imu,
             m.GimbalAttitude,
+            m.Exposure,
             m.PositionHint,
             m.EkfDeadReckoning,
             m.GpsInput,
@@ -178,7 +180,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "vision",
         "terrafix.vision.node",
-        (m.Origin, m.Frame, m.Health),
+        (m.Origin, m.Frame, m.Health, m.Exposure),
         (
             m.Origin,
             m.Frame,

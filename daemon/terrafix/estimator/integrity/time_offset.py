@@ -111,10 +111,10 @@ class TimeOffset:
         self._reported_s: float | None = None
 
     def stamped(self, frame: Frame) -> None:
-        """How its source stamps ``frame``: the prior until a first image is compared, and how often an offset begins to
-        drift or jumps."""
-        self.buffered = frame.buffered
-        if self._at_ns is None and frame.stamp_sigma_s != self._prior_sigma_s:
+        """How its source stamps ``frame``: the prior, until a first image is compared or exposures are reported, and
+        how often an offset begins to drift or jumps."""
+        exposed, self.buffered = self.buffered and not frame.buffered, frame.buffered
+        if (self._at_ns is None or exposed) and frame.stamp_sigma_s != self._prior_sigma_s:
             self._prior_sigma_s, self._mass = frame.stamp_sigma_s, _prior(frame.stamp_sigma_s)
 
     def forget_images(self) -> None:

@@ -16,7 +16,8 @@ GAP_TIMES = 3.0  # a gap is longer than this many times the median interval
 
 
 class Fact(NamedTuple):
-    topic: str  # "camera", "mount", "start", "height", "heading", "tilt", "clock", "rate", "vehicles", "left out"
+    # "camera", "mount", "start", "height", "heading", "tilt", "clock", "exposure", "rate", "vehicles", "left out"
+    topic: str
     text: str
 
 
