@@ -126,6 +126,9 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True):
     mount_roll_deg: float = 0.0
     mount_tolerance_deg: float = 5.0  # 1-sigma of the true tilt about the nominal tilt
     gimbal: Gimbal | UnsetType = UNSET  # the camera is on it; unset: fixed to the vehicle
+    # Rolling shutter: time from the exposure of the first row to that of the last; ``t_ns`` of a Frame is that of the
+    # middle row. Unset: all rows are exposed at once.
+    readout_s: float | UnsetType = UNSET
 
 
 class Origin(Message, frozen=True, kw_only=True):
@@ -207,6 +210,13 @@ class GimbalAttitude(Message, frozen=True, kw_only=True):
     device: int = 0  # gimbal_device_id, or component id of the gimbal; 0: the message names none
 
 
+class Exposure(Message, frozen=True, kw_only=True):
+    """The autopilot reports that a camera has exposed an image at ``t_ns``."""
+
+    kind: str  # CAMERA_FEEDBACK, CAMERA_IMAGE_CAPTURED, CAMERA_TRIGGER
+    number: int  # as its sender counts
+
+
 class SourceEnded(Message, frozen=True, kw_only=True):
     """The source has no more frames."""
 
@@ -277,6 +287,13 @@ class Relocalization(Message, frozen=True, kw_only=True):
 # --- estimator to anchor --------------------------------------------------------------------------
 
 
+class ReadoutMotion(msgspec.Struct, frozen=True, kw_only=True):
+    """How a camera with a rolling shutter moved at a frame, in its own axes."""
+
+    rate_radps: Vec3
+    speed_per_s: Vec3  # velocity over the height above ground
+
+
 class Prediction(Message, frozen=True, kw_only=True):
     """Predicted camera pose at frame ``frame_id`` (the prior for map matching), without a map match of that frame."""
 
@@ -294,6 +311,7 @@ class Prediction(Message, frozen=True, kw_only=True):
     prior_t_ns: int = 0  # t_ns of the InitialPosition or EkfDeadReckoning that reset the position; 0: no reset
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
     joined: bool = True  # something other than dead reckoning ties that fragment to the flight; True without a fragment
+    readout_motion: ReadoutMotion | UnsetType = UNSET  # of a camera with a rolling shutter, where it is known
 
 
 # --- anchor ---------------------------------------------------------------------------------------
@@ -963,6 +981,7 @@ AnyMessage = (
     | VehicleState
     | Imu
     | GimbalAttitude
+    | Exposure
     | SourceEnded
     | Odometry
     | Relocalization

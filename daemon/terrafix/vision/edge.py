@@ -16,9 +16,10 @@ from terrafix.core.errors import SourceError
 from terrafix.core.frames import FrameWriter
 from terrafix.core.initial_position import Bounds, map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import Edge, NodeContext
-from terrafix.messages import OVERTAKEN, Health, Message, SourceEnded, SourceFacts
+from terrafix.messages import OVERTAKEN, Exposure, Health, Message, SourceEnded, SourceFacts
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_configured
+from terrafix.vision.sources.exposed import ReportedExposures
 from terrafix.vision.sources.facts import facts_of
 
 QUEUE_SHOTS = 3  # shots with pixels that are read ahead from a recording that is not played in real time
@@ -55,6 +56,7 @@ class SourceEdge:
         self._first_id = 0
         self._changed = threading.Condition()
         self._shots: deque[Shot] = deque()
+        self._exposures = ReportedExposures()
         self._dropped: deque[Message] = deque(maxlen=MAX_DROPPED_MESSAGES)
         self._stopping = threading.Event()
         self._count = 0
@@ -84,7 +86,8 @@ class SourceEdge:
         if shot is not None:
             if shot.image is not None:
                 self._frames.put(shot.frame.frame_id, shot.image)
-            messages += [*shot.imu, *shot.states, *shot.others, shot.frame]
+            frame = self._exposures.exposed(shot.frame) if self._source.live else shot.frame
+            messages += [*shot.imu, *shot.states, *shot.others, frame]
         elif ended and not self._end_published:
             self._reading.result()  # re-raises an exception of the reader thread in this process
             self._end_published = True
@@ -92,7 +95,9 @@ class SourceEdge:
         return messages
 
     def on_message(self, message: Message) -> None:
-        """Takes the thermal band of Health."""
+        """Takes the thermal band of Health, and exposures."""
+        if isinstance(message, Exposure):
+            self._exposures.add(message)
         if isinstance(message, Health) and self._rate is not None:
             self._rate.band = message.band
 

@@ -16,7 +16,14 @@ import numpy as np
 
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.core.pose import log_so3
-from terrafix.estimator.integrity.offset_drift import DRIFT_GRID_S, RATES, RESOLUTION_S2, Hazards, predicted, transitions
+from terrafix.estimator.integrity.offset_drift import (
+    DRIFT_GRID_S,
+    RATES,
+    RESOLUTION_S2,
+    Hazards,
+    predicted,
+    transitions,
+)
 from terrafix.estimator.integrity.velocity_evidence import (
     DEGREES_OF_FREEDOM,
     FIRST_GUESS,
@@ -24,7 +31,7 @@ from terrafix.estimator.integrity.velocity_evidence import (
     VelocityEvidence,
 )
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
-from terrafix.estimator.models.plane_motion import , Ground, relative_pose
+from terrafix.estimator.models.plane_motion import MIN_MOTION_PAIRS, Ground, relative_pose
 from terrafix.messages import STAMP_SIGMA_S, CalibrationFault, Frame, Odometry, Verdict
 
 FAR_S = 3.0 * STAMP_SIGMA_S  # s: a larger offset is not that of transfer alone [spec: three sigmas]
@@ -46,7 +53,8 @@ TILT_SIGMA_RAD = np.radians(10.0)  # [spec: beyond the lean of a vehicle within 
 HEIGHT_SHARE = 0.1  # 1-sigma of the height, share of it: rotations do not depend on it [tuned]
 # Least share of the noise that the images have. Without a limit two of three healthy flights had a false offset.
 MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
-MAX_VELOCITY_GAP_S = 2.0  # s between two velocities that are compared [spec: the slowest camera, a frame in two seconds]
+# s between two velocities that are compared [spec: the slowest camera, a frame in two seconds]
+MAX_VELOCITY_GAP_S = 2.0
 MAX_NATS = 6.0  # of one comparison: twice MAX_STEP of the monitors [spec: monitors/cusum.py]
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
 APPLY_MAX_SIGMA_S = 0.25  # s: largest 1-sigma of an offset that is applied [tuned]
@@ -106,10 +114,10 @@ class TimeOffset:
         self._reported_s: float | None = None
 
     def stamped(self, frame: Frame) -> None:
-        """How its source stamps ``frame``: the prior until a first image is compared, and how often an offset begins to
-        drift or jumps."""
-        self.buffered = frame.buffered
-        if self._at_ns is None and frame.stamp_sigma_s != self._prior_sigma_s:
+        """How its source stamps ``frame``: the prior, until a first image is compared or exposures are reported, and
+        how often an offset begins to drift or jumps."""
+        exposed, self.buffered = self.buffered and not frame.buffered, frame.buffered
+        if (self._at_ns is None or exposed) and frame.stamp_sigma_s != self._prior_sigma_s:
             self._prior_sigma_s, self._mass = frame.stamp_sigma_s, _prior(frame.stamp_sigma_s)
 
     def forget_images(self) -> None:
@@ -123,7 +131,7 @@ class TimeOffset:
         self._stamps_ns[odometry.frame_id] = self._newest_ns = odometry.t_ns
         self._density = None
         keyframe_ns = self._stamps_ns.get(odometry.keyframe_id)
-        seen = odometry.verdict is Verdict.ACCEPTED and len(odometry.two_view) >= 
+        seen = odometry.verdict is Verdict.ACCEPTED and len(odometry.two_view) >= MIN_MOTION_PAIRS
         if seen and keyframe_ns is not None and keyframe_ns < odometry.t_ns:
             self._pending.append((odometry, keyframe_ns, max(agl_m, 1.0)))
         reach_ns = round(-DRIFT_GRID_S[0] * 1e9) + REPORT_WAIT_NS

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from terrafix.core.geodesy import rot_w_b
 from terrafix.core.inertial import GRAVITY_MPS2, covers, rotate_to_world
+from terrafix.core.pose import log_so3
 from terrafix.estimator.measurements.gimbal import GimbalReports, euler_of
 from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.messages import Imu, VehicleState
@@ -25,6 +27,7 @@ BOX = np.linspace(-1.0, 1.0, 9)  # where reported angles are averaged about a ti
 REORDER_NS = 200_000_000  # by which states may come out of order [tuned]
 # Between readings, and from the last one to the frame: acceleration is interpolated linearly.
 MAX_READING_GAP_NS = 120_000_000  # [tuned]
+RATE_SPAN_NS = 40_000_000  # on each side: two intervals of the requested attitudes [spec: STREAMS_HZ]
 # at 4 Hz, ArduPilot's default, a vehicle turns too far between two [spec: ATTITUDE rate]
 MAX_ATTITUDE_GAP_NS = 260_000_000
 
@@ -187,6 +190,19 @@ class Telemetry:
             return None
         at_ns = t_ns[:, None] + about_ns
         return np.stack([np.interp(at_ns, turns[0], angle).mean(axis=1) for angle in _unwrapped(turns[1])])
+
+    def vehicle_rate_radps(self, t_ns: int) -> np.ndarray | None:
+        """(3,) of the vehicle about its axes forward, right and down at ``t_ns``, by the gyroscopes; by the attitudes
+        where there are none. None where neither covers that."""
+        rates = self._rates.around(t_ns - RATE_SPAN_NS, t_ns + RATE_SPAN_NS)
+        if rates is not None and np.abs(rates[0] - t_ns).min() <= MAX_READING_GAP_NS:
+            near = np.abs(rates[0] - t_ns) <= max(RATE_SPAN_NS, int(np.abs(rates[0] - t_ns).min()))
+            return np.asarray(rates[1][:, near].mean(axis=1))
+        turns = self._turns.around(t_ns - RATE_SPAN_NS, t_ns + RATE_SPAN_NS)
+        if turns is None or np.abs(turns[0] - t_ns).min() > MAX_ATTITUDE_GAP_NS:
+            return None
+        first, last = (rot_w_b(*turns[1][:, at]) for at in (0, -1))
+        return np.asarray(log_so3(first.T @ last)) / ((turns[0][-1] - turns[0][0]) * 1e-9)
 
     def attitudes_about(self, t_ns: np.ndarray) -> np.ndarray | None:
         """-> R_w_b (N, 3, 3) about times (N,) [ns], as ``turned_about``, of what the camera is fixed to."""

@@ -1,5 +1,6 @@
 """telemetry.tlog of a simulated flight: the autopilot's packets as a ground station records them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -30,7 +31,7 @@ class TelemetryLog:
     def __init__(self, autopilot: SimAutopilot, t0_us: int) -> None:
         """``t0_us``: UNIX time of the flight's zero, in microseconds."""
         self._autopilot, self._t0_us = autopilot, t0_us
-        self._records: list[bytes] = []
+        self._records: list[tuple[int, bytes]] = []
         sender = mavlink.MAVLink(None, srcSystem=255, srcComponent=COMPANION)
         for message_id, rate_hz in RATES_HZ.items():
             request = mavlink.MAVLink_command_long_message(
@@ -42,11 +43,12 @@ class TelemetryLog:
         self._autopilot.step(readings.t_s, readings)
         packets = self._autopilot.transmit()
         if packets:
-            self._records.append(record(self._t0_us + round(readings.t_s * 1e6), packets))
+            self._records.append((self._t0_us + round(readings.t_s * 1e6), packets))
 
-    def write(self, path: Path) -> None:
-        """Writes the file. Raises OutputError."""
+    def write(self, path: Path, others: Sequence[tuple[float, bytes]] = ()) -> None:
+        """Writes the file. ``others``: seconds and packets of other devices. Raises OutputError."""
+        records = [*self._records, *((self._t0_us + round(t_s * 1e6), packets) for t_s, packets in others)]
         try:
-            path.write_bytes(b"".join(self._records))
+            path.write_bytes(b"".join(record(*one) for one in sorted(records)))
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another --out") from None
