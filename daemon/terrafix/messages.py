@@ -138,6 +138,7 @@ class Origin(Message, frozen=True, kw_only=True):
     yaw_sigma_deg: float
     agl_sigma_m: float
     attitude_sigma_deg: float  # of reported roll and pitch
+    flight_id: str = ""  # UUID; with the number of a frame it names that frame over all flights (core/flight_id.py)
 
 
 OVERTAKEN = "overtaken: a newer frame was there first"  # error of a frame that was left out, not of the camera
@@ -510,6 +511,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     emitted_at_ns: int  # time of publication; in a replay, the time of the frame
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
     joined: bool = True  # ... is joined to the flight (as in Prediction)
+    frame_uid: str = ""  # UUID of the flight and number of the frame; empty: the flight has no id
 
     @property
     def is_placed(self) -> bool:
