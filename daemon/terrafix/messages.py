@@ -830,6 +830,8 @@ class EkfStatus(Message, frozen=True, kw_only=True):
     flags: int  # EKF_STATUS_FLAGS
     position_ratio: float  # horizontal innovation over its gate (test ratio): 1 is the limit
     velocity_ratio: float
+    lat_deg: float | None = None  # its own horizontal position, not more than a second old; None: it reports none
+    lon_deg: float | None = None
 
 
 class WallClock(Message, frozen=True, kw_only=True):
