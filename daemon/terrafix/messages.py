@@ -142,10 +142,11 @@ class Origin(Message, frozen=True, kw_only=True):
     yaw_sigma_deg: float
     agl_sigma_m: float
     attitude_sigma_deg: float  # of reported roll and pitch
+    flight_id: str = ""  # UUID; with the number of a frame it names that frame over all flights (core/flight_id.py)
 
 
 class Fact(NamedTuple):
-    topic: str  # "camera", "mount", "start", "height", "heading", "tilt", "clock", "rate", "vehicles", "left out"
+    topic: str  # "camera", "mount", "start", "height", "heading", "tilt", "clock", "exposure", "rate", "vehicles", "left out"
     text: str
 
 
@@ -542,6 +543,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     emitted_at_ns: int  # time of publication; in a replay, the time of the frame
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
     joined: bool = True  # ... is joined to the flight (as in Prediction)
+    frame_uid: str = ""  # UUID of the flight and number of the frame; empty: the flight has no id
 
     @property
     def is_placed(self) -> bool:
@@ -866,6 +868,8 @@ class EkfStatus(Message, frozen=True, kw_only=True):
     flags: int  # EKF_STATUS_FLAGS
     position_ratio: float  # horizontal innovation over its gate (test ratio): 1 is the limit
     velocity_ratio: float
+    lat_deg: float | None = None  # its own horizontal position, not more than a second old; None: it reports none
+    lon_deg: float | None = None
 
 
 class WallClock(Message, frozen=True, kw_only=True):

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, ModelError, UsageError
+from terrafix.core.flight_id import recorded_flight_id
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import start_is_unknown, with_map_center
@@ -85,6 +86,10 @@ def replay(
     opened, source = flight, wrap_source(flight)
     package = package_of(_map_of(map_path, config, source), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
+    if not origin.flight_id:
+        first = next(opened.shots(), None)
+        flight_id = recorded_flight_id(origin, None if first is None else first.image)
+        origin = msgspec.structs.replace(origin, flight_id=flight_id)
     facts = facts_of(opened)
     if progress:
         for line in fact_lines(source.name(), facts):

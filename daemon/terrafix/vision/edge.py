@@ -13,6 +13,7 @@ import msgspec
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
+from terrafix.core.flight_id import live_flight_id
 from terrafix.core.frames import FrameWriter
 from terrafix.core.initial_position import Bounds, map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import Edge, NodeContext
@@ -76,7 +77,9 @@ class SourceEdge:
             )
             ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
             said = SourceFacts(t_ns=self._zero_ns, name=self._source.name(), facts=tuple(facts_of(self._source)))
-            return [msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m), said]
+            flight_id = live_flight_id(self._zero_ns)
+            origin = msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m, flight_id=flight_id)
+            return [origin, said]
         ended = self._reading.done()
         with self._changed:
             messages = list(self._dropped)

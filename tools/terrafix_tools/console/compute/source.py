@@ -57,7 +57,8 @@ class UploadedImages:
         self._wait, self._begins, self._steer = wait, begins, steer
         with database.read() as db:
             self.new = NewFlight.model_validate_json(flights.row_of(db, flight_id).spec)
-        self._origin, self.stored = origin(self.new), stored_camera(self.new)
+        self.stored = stored_camera(self.new)
+        self._origin = msgspec.structs.replace(origin(self.new), flight_id=flight_id)
 
     def origin(self) -> Origin:
         return self._origin
