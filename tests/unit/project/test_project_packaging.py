@@ -85,7 +85,7 @@ def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
     declared |= (modules(EXTRAS["train"]) - EXPORTER) | modules(EXTRAS["faiss"]) | modules(EXTRAS["fleet"])
     declared |= modules(EXTRAS["vehicle"])
-    declared |= modules(EXTRAS["console"])
+    declared |= modules(EXTRAS["console"]) | modules(EXTRAS["rosbag"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"]) | modules(EXTRAS["nightly"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
@@ -96,7 +96,18 @@ def test_every_dependency_has_a_version_range() -> None:
         *CORE.values(),
         *(
             one
-            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "console", "vehicle", "gstreamer", "train")
+            for extra in (
+                "ground",
+                "sim",
+                "cluster",
+                "faiss",
+                "fleet",
+                "console",
+                "rosbag",
+                "vehicle",
+                "gstreamer",
+                "train",
+            )
             for one in EXTRAS[extra].values()
         ),
     ]:
@@ -228,7 +239,7 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
     folders = {path.name for path in (unpacked / "terrafix_tools").iterdir()} | {
         path.name for path in unpacked.iterdir()
     }
-    assert not folders & {"terrafix_lab", "console", "fleet", "finalise", "compare", "locate", "parallel"}
+    assert not folders & {"terrafix_lab", "console", "export", "fleet", "finalise", "compare", "locate", "parallel"}
     assert not (unpacked / "terrafix_engines" / "train").exists()
     shown = in_wheel(unpacked, "--help")
     commands = [line.split()[1] for line in shown.stdout.splitlines() if re.match(r"│ [a-z]", line)]
