@@ -10,13 +10,13 @@ from broken_files import BROKEN, CAMERA_LINES
 from terrafix.core.config import LinkSection, load
 from terrafix.core.errors import ConfigError, SourceError, TerrafixError, UsageError
 from terrafix.vision.sources.description import camera_of, read_description
-from terrafix_lab.sim.autopilot.practice import WRONG, Practice
 from terrafix_tools import installation
 from terrafix_tools.cli import app
 from terrafix_tools.configuration.schema import FOLDER, NAMES, schemas, text_of
 from terrafix_tools.preflight import autopilot as conversation
 from terrafix_tools.preflight.lines import CheckStatus
 from terrafix_tools.preflight.parameter_check import check_parameters
+from terrafix_tools.preflight.practice import WRONG, Practice
 from terrafix_tools.preflight.rules import Context
 
 ROOT = Path(__file__).resolve().parents[3]

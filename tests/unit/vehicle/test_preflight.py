@@ -21,8 +21,6 @@ from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.signature import generate
 from terrafix.link.gnss.previous_source import PreviousSource, PreviousSourceFile
 from terrafix.link.mavlink.transport import Address, Chunk
-from terrafix_lab.sim.autopilot.ground import GROUND_DEFAULTS as DEFAULTS
-from terrafix_lab.sim.autopilot.ground import GroundAutopilot
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
@@ -34,6 +32,8 @@ from terrafix_tools.preflight.lines import CheckStatus, Line, number
 from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.rules import ALWAYS, GPS_INPUT_RULES, LOCAL_RULES, Context
 from terrafix_tools.preflight.run import _parameter_lines, _vehicle_lines, preflight
+from terrafix_tools.preflight.simulated import GROUND_DEFAULTS as DEFAULTS
+from terrafix_tools.preflight.simulated import GroundAutopilot
 
 ROOT = Path(__file__).resolve().parents[3]
 VEHICLES = ROOT / "config" / "vehicles"

@@ -1,6 +1,5 @@
 """The command `terrafix preflight`."""
 
-import importlib
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
@@ -59,8 +58,10 @@ def preflight(
 
 
 def _practice(link: str) -> Any:
-    """The simulated autopilot, which is of the lab: that may not be installed (ModuleNotFoundError)."""
+    """The simulated autopilot. Raises UsageError: there is another."""
+    from terrafix_tools.preflight.practice import Practice
+
     if link:
         raise UsageError("--simulate brings its own autopilot; omit --link")
     typer.echo("A simulated ArduCopter 4.6, on the ground. One of its parameters is wrong: find it.\n", err=True)
-    return importlib.import_module("terrafix_lab.sim.autopilot.practice").Practice()
+    return Practice()

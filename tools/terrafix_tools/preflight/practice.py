@@ -10,7 +10,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.installed_files import installed_files
-from terrafix_lab.sim.autopilot.ground import GROUND_DEFAULTS, GroundAutopilot
+from terrafix_tools.preflight.simulated import GROUND_DEFAULTS, GroundAutopilot
 
 POLL_S = 0.002
 DATAGRAM_MAX = 4096

@@ -5,8 +5,29 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.link.mavlink.transport import Address, Chunk
-from terrafix_lab.sim.autopilot.parameters import FIRMWARE
 
+# Of the simulated vehicles, too
+FIRMWARE = {  # defaults of ArduPilot 4.6
+    "AHRS_OPTIONS": 0.0,  # bit 0: no fall-back to DCM in a fixed wing
+    "ARMING_CHECK": 1.0,  # bit 0 all, bit 3 GPS
+    "ARSPD_USE": 1.0,
+    "EK3_CHECK_SCALE": 100.0,  # per cent of the limits below
+    "EK3_GPS_CHECK": 31.0,  # bits: satellites, HDOP, speed accuracy, position accuracy, yaw
+    "EK3_SRC1_POSXY": 3.0,  # 0 none, 3 GPS
+    "EK3_SRC1_VELXY": 3.0,
+    "EK3_SRC1_POSZ": 1.0,
+    "EK3_SRC1_VELZ": 3.0,
+    "EK3_SRC2_POSXY": 0.0,
+    "EK3_SRC2_VELXY": 0.0,
+    "EK3_SRC3_POSXY": 0.0,
+    "EK3_SRC3_VELXY": 0.0,
+    "GPS1_TYPE": 1.0,
+    "GPS1_DELAY_MS": 0.0,
+    "GPS2_TYPE": 0.0,
+    "GPS2_DELAY_MS": 0.0,
+    "GPS_AUTO_SWITCH": 1.0,  # 0 the primary alone, 1 the best, 2 blend, 4 the primary if it has a 3D fix
+    "GPS_PRIMARY": 0.0,
+}
 # Defaults of ArduPilot 4.6 (read from its firmware in software in the loop)
 GROUND_DEFAULTS = FIRMWARE | {
     "AHRS_EKF_TYPE": 3,
