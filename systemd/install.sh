@@ -19,7 +19,8 @@ while [ $# -gt 0 ]; do
         --prefix) prefix=$2; shift 2 ;;
         --no-pip) pip=no; shift ;;
         --package) package=$2; shift 2 ;;
-        *) echo "install.sh: unknown option $1; see the head of this file" >&2; exit 2 ;;
+        -h | --help) sed -n '2,/^set -eu/{/^#/s/^# \{0,1\}//p;}' "$0"; exit 0 ;;
+        *) echo "install.sh: unknown option $1; see --help" >&2; exit 2 ;;
     esac
 done
 if [ -z "$prefix" ] && [ "$(id -u)" -ne 0 ]; then

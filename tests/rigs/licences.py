@@ -37,8 +37,10 @@ NAMED = {
     "Python Software Foundation License": "PSF-2.0",
     "The Unlicense (Unlicense)": "Unlicense",
 }
-# Extras that the check does not install, because they need a compiler or a GPU: read on their pages.
+# Extras that the check does not install, because they need a compiler or a GPU, or are for one
+# export: read on their pages.
 ELSEWHERE = {
+    "rosbags": "Apache-2.0",
     "pygobject": "LGPL-2.1-or-later",
     "systemd-python": "LGPL-2.1-or-later",
     "torch": "BSD-3-Clause",

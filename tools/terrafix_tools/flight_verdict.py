@@ -48,6 +48,11 @@ class FlightVerdict:
             return "do not trust it"
         return "trust it" if self.share == 1.0 else "trust it in part"
 
+    @property
+    def is_trusted(self) -> bool:
+        """All of the flight is."""
+        return bool(self.spans) and self.share == 1.0
+
     def text(self) -> str:
         """One line for the operator."""
         because = f" ({'; '.join(self.reasons)})" if self.reasons else ""

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, ModelError, UsageError
@@ -37,6 +37,7 @@ from terrafix_tools.in_process import InProcessShell
 from terrafix_tools.likely_cause import UNMEASURED
 from terrafix_tools.live import swapped_hint
 from terrafix_tools.map_probe import likely_factor
+from terrafix_tools.progress import LineProgress
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.rerun.frames import RecordedFrames
 from terrafix_tools.source.text import fact_lines
@@ -264,7 +265,7 @@ def _not_covered(origin: Origin, bounds_m: tuple[float, float, float, float]) ->
 @contextmanager
 def _bar(shown: bool, total: int | None) -> Iterator[Callable[[], None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+    with LineProgress(*columns, console=Console(stderr=True), shown=shown) as progress:
         task = progress.add_task("replay", total=total)
         yield lambda: progress.advance(task)
 
