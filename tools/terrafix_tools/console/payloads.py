@@ -189,8 +189,20 @@ class InputRequest(BaseModel):
     frame_id: int
 
 
+class WholeVerdict(BaseModel):
+    """On a completed flight, as summary.json has it. ``trusted_s``: from and to, seconds; ``trusted_files``: first and
+    last image of each of these spans; ``reasons``: why the rest cannot be trusted; ``cause``: the likely one."""
+
+    verdict: str  # "trust it", "trust it in part", "do not trust it"
+    trusted_s: list[tuple[float, float]]
+    trusted_files: list[tuple[str, str]]
+    trusted_share: float
+    reasons: list[str]
+    cause: str = ""
+
+
 class Flight(BaseModel):
-    """``start``: that of its creation."""
+    """``start``: that of its creation, or of the source of a live flight. ``verdict``: None before its end."""
 
     flight_id: str
     name: str
@@ -203,6 +215,7 @@ class Flight(BaseModel):
     images: Images
     fragments: list[Fragment]
     request: InputRequest | None
+    verdict: WholeVerdict | None = None
     events_url: str
     last_event_id: int
     error: str = ""  # why the flight cannot be processed

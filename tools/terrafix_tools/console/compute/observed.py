@@ -33,6 +33,7 @@ from terrafix_tools.console.events import (
     FrameProcessed,
     FrameRefined,
     HintAnswered,
+    OfFrame,
     ProcessingBlocked,
     RecoveryStarted,
     RecoverySucceeded,
@@ -50,6 +51,7 @@ from terrafix_tools.console.payloads import (
     FrameResult,
     Gps,
     InputRequest,
+    WholeVerdict,
 )
 from terrafix_tools.estimates import yaw_deg_of
 from terrafix_tools.finalised import FinalRow
@@ -107,6 +109,7 @@ class FlightObserver:
         self._refined: list[FrameRefined] = []
         self._scales: dict[int, float] = {}  # by frame: metres per unit, of the newest refinement that states them
         self._frame_of: dict[str, int] = {}  # by file
+        self._file_of: dict[int, str] = {}  # by frame
         self._finalised = 0
 
     def resume(self, state: FlightState) -> None:
@@ -122,7 +125,7 @@ class FlightObserver:
                     self.origin_ns = message.t_ns
                 case Frame():
                     self._shown, self._match = message, None
-                    self._frame_of[message.file] = message.frame_id
+                    self._frame_of[message.file], self._file_of[message.frame_id] = message.frame_id, message.file
                 case NavEstimate():
                     self.estimates[message.frame_id] = message
                 case MapMatch():
@@ -178,8 +181,8 @@ class FlightObserver:
             self._scales[pose.frame_id] = pose.m_per_unit
         return _refined(pose, source, self._scales.get(pose.frame_id))
 
-    def completed(self, not_finalised: str = "") -> FlightCompleted:
-        """``not_finalised``: why the flight has no solution as a whole."""
+    def completed(self, verdict: WholeVerdict | None = None, not_finalised: str = "") -> FlightCompleted:
+        """``verdict``: on the flight, None: it has no record; ``not_finalised``: why it has no solution as a whole."""
         totals = self._totals
         median = float(np.median(totals.radii_m)) if totals.radii_m else None
         return FlightCompleted(
@@ -193,11 +196,15 @@ class FlightObserver:
                 "hints": totals.hints,
                 "median_radius95_m": None if median is None else round(median, 2),
                 "not_finalised": not_finalised,
-            }
+            },
+            verdict=verdict,
         )
 
     def _outcome(self, events: list[Event]) -> FrameOutcome:
         events = [*events, *self._others, *self._refined]
+        for event in events:
+            if isinstance(event, (OfFrame, ProcessingBlocked)) and event.frame_id is not None:
+                event.file = self._file_of.get(event.frame_id, "")
         self._totals.refined |= {refined.frame_id for refined in self._refined}
         outcome = FrameOutcome(refined=self._refined, events=events, state=self._state, request=self._request)
         self._others, self._refined = [], []

@@ -28,6 +28,7 @@ from terrafix_tools.console.payloads import (
     NewFlight,
     RouteArea,
     UserFix,
+    WholeVerdict,
 )
 from terrafix_tools.console.problems import Refusal
 from terrafix_tools.console.store.schema import events, flights, fragments, headings, hints, images, results
@@ -169,10 +170,19 @@ def _flight(db: sa.Connection, row: "sa.Row") -> Flight:
         ),
         fragments=[Fragment(**{k: v for k, v in f._mapping.items() if k != "flight_id"}) for f in found],
         request=None if row.request is None else InputRequest.model_validate_json(row.request),
+        verdict=_verdict(db, row.id) if row.state == FlightState.COMPLETED.value else None,
         events_url=f"/flights/{row.id}/events",
         last_event_id=last_event_id(db, row.id),
         error=row.error,
     )
+
+
+def _verdict(db: sa.Connection, flight_id: str) -> WholeVerdict | None:
+    """On a completed flight; None: it was completed by an earlier version, or while no service saw it."""
+    query = sa.select(events.c.data).where(events.c.flight_id == flight_id, events.c.key == "completed 0")
+    data = db.execute(query).scalar_one_or_none()
+    given = None if data is None else json.loads(data).get("verdict")
+    return None if given is None else WholeVerdict.model_validate(given)
 
 
 def _count(db: sa.Connection, table: sa.Table, flight_id: str) -> int:

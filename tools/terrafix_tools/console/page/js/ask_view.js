@@ -8,6 +8,7 @@ import {FrameView} from "./frame_view.js";
 import {square} from "./geo.js";
 import {L, baseMap} from "./map_view.js";
 import {t} from "./texts.js";
+import {words} from "./words.js";
 
 const HINT_M = 500; // default radius of a hint
 
@@ -113,7 +114,7 @@ export class AskView {
       const {detail} = await post(`/flights/${this.flight.flight_id}/${path}`, body);
       this.onSent?.(path, body);
       this.close();
-      toast(t("fix_sent", detail));
+      toast(t("fix_sent", words(detail)));
     } catch (error) {
       this.update();
       this.line.textContent = error.message;

@@ -11,17 +11,17 @@ import {stateBadge} from "./list_view.js";
 import {MapView} from "./map_view.js";
 import {FlightModel} from "./model.js";
 import {uploads, startUpload} from "./new_view.js";
-import {AutopilotPanel, LogPanel, ObjectPanel, OverviewPanel, SystemPanel, VerdictPanel} from "./panels.js";
+import {LogPanel, ObjectPanel, OverviewPanel, VehiclePanel, VerdictPanel} from "./panels.js";
 import {mayAct} from "./session.js";
 import {SOURCES, sign} from "./sources.js";
 import {EventStream} from "./stream.js";
 import {t} from "./texts.js";
+import {words} from "./words.js";
 import {BATCH, inOrder, isSequence, readTable} from "./upload.js";
 
 const EARLIER_EVENTS = 1000; // that are read again when a flight is opened: the logs keep as many
 const REFRESH_MS = 1000; // between two readings of the flight itself, and of live images
 const TICK_MS = 500; // ages are shown anew
-const HEALTH_MS = 5000;
 
 export class FlightView {
   constructor(main, middle, flightId) {
@@ -38,8 +38,7 @@ export class FlightView {
     this.build();
     const after = flight.request ? 0 : Math.max(0, flight.last_event_id - EARLIER_EVENTS);
     this.stream = new EventStream(this.flightId, after, (event) => this.event(event), (state, status) => this.connection(state, status));
-    this.timers = [setInterval(() => this.tick(), TICK_MS), setInterval(() => this.health(), HEALTH_MS)];
-    this.health();
+    this.timers = [setInterval(() => this.tick(), TICK_MS)];
     this.draw();
   }
 
@@ -55,12 +54,13 @@ export class FlightView {
   // --- parts ---------------------------------------------------------------------------------------
 
   build() {
-    this.glance = new Glance();
+    this.glance = new Glance(() => this.draw());
     this.lost = h("p", {class: "banner lost", role: "alert", hidden: true});
     this.asking = h("div", {class: "banner ask-banner", role: "alert", hidden: true});
     this.problem = h("p", {class: "banner failed", role: "alert", hidden: true});
+    this.through = h("div", {class: "banner through", role: "status", hidden: true});
     this.mapBox = h("div", {class: "map", "aria-label": t("map_help")});
-    const main = h("div", {class: "flight"}, this.lost, this.problem, this.asking, this.glance.element,
+    const main = h("div", {class: "flight"}, this.lost, this.problem, this.asking, this.through, this.glance.element,
       h("div", {class: "stage"}, this.mapBox, this.tools(), this.legend(), this.info ? null : h("p", {class: "no-map"}, t("no_such_map", this.model.flight.map.name))),
       h("aside", {class: "side", "aria-label": t("details")}, this.frameCard(), this.uploadSlot = h("div", {}), this.tabs()));
     fill(this.main, main);
@@ -91,7 +91,8 @@ export class FlightView {
     this.mapBox.addEventListener("keydown", this.escape);
     return h("div", {class: "tools", role: "toolbar", "aria-label": t("tools")}, this.followButton,
       h("button", {onclick: () => this.mapView.fit()}, t("fit")),
-      toggle(t("all_ellipses"), true, (on) => { this.mapView.track.all = on; this.mapView.track.redraw(); }), this.measureButton, this.measured);
+      toggle(t("all_ellipses"), true, (on) => { this.mapView.track.all = on; this.mapView.track.redraw(); }), this.measureButton,
+      this.glance.format, this.glance.copy, this.measured);
   }
 
   legend() {
@@ -123,8 +124,8 @@ export class FlightView {
 
   tabs() {
     this.objects = new ObjectPanel();
-    this.panels = {overview: new OverviewPanel(this.actions()), verdicts: new VerdictPanel(), autopilot: new AutopilotPanel(),
-      system: new SystemPanel(), log: new LogPanel(), objects: this.objects, export: {element: this.exports(), update() {}}};
+    this.panels = {overview: new OverviewPanel(this.actions()), ...(this.model.isLive ? {vehicle: new VehiclePanel()} : {}),
+      verdicts: new VerdictPanel(), log: new LogPanel(), objects: this.objects, export: {element: this.exports(), update() {}}};
     const names = Object.keys(this.panels);
     const list = h("div", {class: "tabs", role: "tablist"});
     const show = (name, focus = false) => {
@@ -228,13 +229,6 @@ export class FlightView {
     this.showLost();
   }
 
-  async health() {
-    try {
-      this.serviceHealth = await get("/health");
-      if (this.tab === "system") this.dirty = true;
-    } catch { /* the stream tells */ }
-  }
-
   showLost() {
     const {model} = this;
     this.lost.hidden = model.connection !== "lost";
@@ -252,11 +246,12 @@ export class FlightView {
     this.glance.update(model);
     this.showLost();
     this.problem.hidden = !flight.error;
-    this.problem.textContent = flight.error;
+    this.problem.textContent = words(flight.error);
     this.drawRequest();
+    this.drawThrough();
     this.mapView.show(model, this.selected, flight.state !== "completed");
     this.drawFrame();
-    this.panels[this.tab].update(model, this.serviceHealth);
+    this.panels[this.tab].update(model);
     if (this.more) {
       const open = !model.isLive && flight.state !== "completed";
       this.moreLabel.hidden = this.more.disabled = this.completeButton.hidden = !open;
@@ -274,9 +269,19 @@ export class FlightView {
     this.requestKey = key;
     this.asking.hidden = !request;
     if (!request) return void this.mapView.showCandidates([]);
-    fill(this.asking, h("span", {}, t("ask_banner", number(request.frame_id))), mayAct() ? h("button", {class: "primary", onclick: () => this.help()}, t("help")) : null);
+    fill(this.asking, h("span", {}, t("ask_banner", this.model.results.get(request.frame_id)?.file || number(request.frame_id))), mayAct() ? h("button", {class: "primary", onclick: () => this.help()}, t("help")) : null);
     this.mapView.showCandidates(request.candidate_tiles);
     if (this.ask?.request.request_id === request.request_id) this.ask.showPlaces(request.candidate_tiles);
+  }
+
+  /** All images are computed and nobody has said that they are all: the flight asks. */
+  drawThrough() {
+    const {flight, isLive, request} = this.model;
+    const {uploaded, processed} = flight.images;
+    const asks = mayAct() && !isLive && uploaded > 0 && processed >= uploaded && flight.state !== "completed" && !flight.completing && !request && !flight.error && !uploads.has(this.flightId);
+    if (this.through.hidden === !asks) return;
+    this.through.hidden = !asks;
+    if (asks) fill(this.through, h("span", {}, t("through", number(uploaded))), h("button", {class: "primary", onclick: () => this.complete(true)}, t("complete_now")));
   }
 
   drawFrame() {
@@ -294,13 +299,13 @@ export class FlightView {
     }
     this.imageAt = now;
     this.shown = result;
-    this.frameTitle.textContent = t("frame_number", number(result.frame_id));
+    this.frameTitle.textContent = result.file || t("frame_number", number(result.frame_id));
     this.newestButton.setAttribute("aria-pressed", String(this.selected === null));
     this.frame.show(`/flights/${this.flightId}/frames/${result.frame_id}/image`, t("frame_alt", number(result.frame_id)));
     const verdict = model.verdicts.findLast((one) => one.frame_id === result.frame_id && one.measurement === "map");
     fill(this.frameFacts, sign(result.source), h("span", {}, t(`source_${result.source || "none"}`)),
-      h("span", {}, result.match ? t("match_line", result.match.replaceAll("_", " "), result.inliers ? t("inliers", number(result.inliers)) : "") : t("no_match")),
-      verdict && verdict.detail ? h("span", {class: "soft"}, verdict.detail) : null, h("span", {class: "soft"}, result.file), result.error ? h("span", {class: "error"}, result.error) : null);
+      h("span", {}, result.match ? t("match_line", t(`verdict_${result.match}`), result.inliers ? t("inliers", number(result.inliers)) : "") : t("no_match")),
+      verdict && verdict.detail ? h("span", {class: "soft"}, words(verdict.detail)) : null, result.file ? h("span", {class: "soft"}, t("frame_number", number(result.frame_id))) : null, result.error ? h("span", {class: "error"}, words(result.error)) : null);
   }
 
   select(id) {
@@ -334,7 +339,7 @@ export class FlightView {
       this.mapView.centre(found.gps);
       this.showTab("objects");
       this.card.classList.remove("large");
-      toast(`${name}: ${coordinate(found.gps)} ± ${metres(found.accuracy_meters)} (95 %)`);
+      toast(`${name}: ${coordinate(found.gps, found.accuracy_meters)} ± ${metres(found.accuracy_meters)} (95 %)`);
     } catch (error) {
       toast(error.message, true);
     }
@@ -349,8 +354,8 @@ export class FlightView {
     this.ask.open();
   }
 
-  async complete() {
-    if (!confirm(t("complete_sure"))) return;
+  async complete(sure = false) {
+    if (!sure && !confirm(t("complete_sure"))) return;
     try {
       this.model.refresh(await post(`/flights/${this.flightId}/complete`));
       this.draw();
