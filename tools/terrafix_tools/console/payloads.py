@@ -103,11 +103,12 @@ class Start(Strict):
 
 
 class Telemetry(Strict):
-    """1-sigma of the headings, heights and attitudes of the images, as [telemetry] of a flight folder."""
+    """1-sigma of the headings, heights and attitudes of the images, as [telemetry] of a flight folder.
+    ``attitude_sigma_deg`` None: that of what states them, photos or a table."""
 
     yaw_sigma_deg: Annotated[float, Field(gt=0, le=360)] = 5.0
     agl_sigma_m: Annotated[float, Field(gt=0, le=10_000)] = 5.0
-    attitude_sigma_deg: Annotated[float, Field(gt=0, le=180)] = 2.0
+    attitude_sigma_deg: Annotated[float, Field(gt=0, le=180)] | None = None
 
 
 class Waypoint(Strict):
@@ -123,8 +124,9 @@ class RouteArea(Strict):
 
 
 class NewFlight(Strict):
-    """``map``: name of a map of the service, or ``area``. ``height_m``: above ground, for images that state none.
-    Without ``start`` the first position is searched on the whole map."""
+    """``map``: name of a map of the service, or ``area``. ``height_m``: above ground, and ``yaw_deg``: heading, for
+    images that state none; for all with ``override``. ``images``: how many the flight has; when they are computed it
+    completes by itself, or asks for a position. Without ``start`` the first position is searched on the whole map."""
 
     name: Annotated[str, Field(max_length=MAX_NAME)] = ""
     camera: Camera
@@ -134,13 +136,40 @@ class NewFlight(Strict):
     map: Annotated[str, Field(min_length=1, max_length=MAX_NAME)] | None = None
     area: RouteArea | None = None
     height_m: Annotated[float, Field(gt=0, le=20_000)] | None = None
-    yaw_deg: Degrees | None = None  # heading for images that state none
+    yaw_deg: Degrees | None = None
+    override: bool = False
+    images: Annotated[int, Field(ge=1, le=20_000)] | None = None
 
     @model_validator(mode="after")
     def _has_one_map(self) -> "NewFlight":
         if (self.map is None) == (self.area is None):
             raise ValueError("give either map or area")
         return self
+
+
+class PhotoFact(BaseModel):
+    """``topic``: lens, mount, start, height, clock, ...; ``text``: what, and from where."""
+
+    topic: str
+    text: str
+
+
+class PhotoFacts(BaseModel):
+    """What photos state of a flight, with a flight.toml beside them, as `terrafix replay` takes it. ``camera`` None: no
+    photo states its focal length, ``problem`` says why. ``height_m``, ``yaw_deg``: of the first photo."""
+
+    width: int
+    height: int
+    camera: Camera | None
+    mount: Mount
+    telemetry: Telemetry
+    start: Start | None
+    height_m: float | None
+    yaw_deg: float | None
+    name: str
+    map: str  # stem of the one that flight.toml names
+    facts: list[PhotoFact]
+    problem: str = ""
 
 
 class MapState(StrEnum):
@@ -156,11 +185,12 @@ class FlightMap(BaseModel):
 
 
 class Images(BaseModel):
-    """``next_number``: that of the next image in the sequence of names; None: any."""
+    """``expected``: how many the flight has, as far as its creation said it; ``last_name``: of the newest image."""
 
     uploaded: int
     processed: int
-    next_number: int | None
+    expected: int | None = None
+    last_name: str | None = None
 
 
 class FragmentState(StrEnum):
@@ -240,7 +270,6 @@ class Accepted(BaseModel):
 
     frames: list[int]
     repeated: bool
-    next_number: int
 
 
 class FrameResult(CameraPose):

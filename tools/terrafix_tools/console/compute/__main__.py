@@ -123,9 +123,18 @@ class FlightProcess:
     def _wait(self) -> None:
         if (outcome := self._observer.images_through()) is not None and outcome.request is not None:
             self._store(f"asked {outcome.request.request_id}", outcome)
+        elif not self._observer.asks and self._has_all_images():
+            with self._database.write() as db:
+                flights.update(db, self._flight_id, completing=True)
+            return
         self._say("waiting")
         if not sys.stdin.readline():
             raise SystemExit(0)
+
+    def _has_all_images(self) -> bool:
+        with self._database.read() as db:
+            count = flights.image_count(db, self._flight_id)
+        return self.source.new.images is not None and count >= self.source.new.images
 
     def _steer(self, hint_id: int, given: Hint | UserFix, t_ns: int) -> PositionHint | None:
         t_ns += hint_id  # nanoseconds: the answer names a hint by its time

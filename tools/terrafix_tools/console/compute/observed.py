@@ -165,6 +165,11 @@ class FlightObserver:
             outcome.heading = result.heading, math.degrees(math.sqrt(max(estimate.cov[35], 0.0)))
         return outcome
 
+    @property
+    def asks(self) -> bool:
+        """A position was asked for, and none has helped yet."""
+        return self._asked
+
     def rest(self) -> FrameOutcome:
         """What messages without a frame add: those after the source has ended."""
         return self._outcome([])

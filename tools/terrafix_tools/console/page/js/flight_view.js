@@ -17,7 +17,8 @@ import {SOURCES, sign} from "./sources.js";
 import {EventStream} from "./stream.js";
 import {t} from "./texts.js";
 import {words} from "./words.js";
-import {BATCH, inOrder, isSequence, readTable} from "./upload.js";
+import {compareNames, sorted} from "./photos.js";
+import {BATCH, readTable} from "./upload.js";
 
 const EARLIER_EVENTS = 1000; // that are read again when a flight is opened: the logs keep as many
 const REFRESH_MS = 1000; // between two readings of the flight itself, and of live images
@@ -30,7 +31,8 @@ export class FlightView {
 
   async open() {
     const flight = await get(`/flights/${this.flightId}`);
-    const [results, maps] = await Promise.all([allResults(this.flightId, true), get("/maps")]);
+    const [results, maps, config] = await Promise.all([allResults(this.flightId, true), get("/maps"), get(`/flights/${this.flightId}/config`)]);
+    this.mountYaw = config.flight.mount?.yaw_deg;
     if (this.closed) return;
     this.info = maps.maps.find((one) => one.name === flight.map.name) ?? null;
     this.model = new FlightModel(flight, results);
@@ -119,7 +121,7 @@ export class FlightView {
 
   enlarge() {
     this.card.classList.toggle("large");
-    this.frame.element.focus();
+    this.frame.focus();
   }
 
   tabs() {
@@ -159,11 +161,12 @@ export class FlightView {
 
   actions() {
     if (!mayAct()) return h("p", {class: "soft"}, t("viewer"));
-    this.more = h("input", {type: "file", multiple: true, accept: "image/jpeg,image/png,.csv", class: "unseen", id: "more", onchange: () => this.addPhotos()});
+    this.more = h("input", {type: "file", multiple: true, accept: "image/jpeg,image/png,.zip,.csv", class: "unseen", id: "more", onchange: () => this.addPhotos(this.more.files)});
     this.moreLabel = h("label", {class: "button", for: "more"}, t("add_photos"));
     this.completeButton = h("button", {onclick: () => this.complete()}, t("complete"));
     this.askButton = h("button", {onclick: () => this.help()}, t("give_position"));
-    return h("div", {class: "actions"}, this.more, this.moreLabel, this.completeButton, this.askButton);
+    const copy = this.model.isLive ? null : h("a", {class: "button", href: `#/new/${this.flightId}`}, t("duplicate"));
+    return h("div", {class: "actions"}, this.more, this.moreLabel, this.completeButton, this.askButton, copy);
   }
 
   exports() {
@@ -274,14 +277,24 @@ export class FlightView {
     if (this.ask?.request.request_id === request.request_id) this.ask.showPlaces(request.candidate_tiles);
   }
 
-  /** All images are computed and nobody has said that they are all: the flight asks. */
+  /** What the flight waits for: the rest of its photos, or the word that they are all; a failure to be tried again. */
   drawThrough() {
     const {flight, isLive, request} = this.model;
-    const {uploaded, processed} = flight.images;
-    const asks = mayAct() && !isLive && uploaded > 0 && processed >= uploaded && flight.state !== "completed" && !flight.completing && !request && !flight.error && !uploads.has(this.flightId);
-    if (this.through.hidden === !asks) return;
-    this.through.hidden = !asks;
-    if (asks) fill(this.through, h("span", {}, t("through", number(uploaded))), h("button", {class: "primary", onclick: () => this.complete(true)}, t("complete_now")));
+    const {uploaded, processed, expected} = flight.images;
+    const open = mayAct() && !isLive && flight.state !== "completed" && !flight.completing && !uploads.has(this.flightId);
+    const through = open && uploaded > 0 && processed >= uploaded && !flight.error;
+    const what = !open ? "" : flight.error ? "failed" : uploaded < (expected ?? 0) ? "resume" : through && request && this.helped ? "helped" : through && !request && !expected ? "through" : "";
+    if (this.waits === `${what}${uploaded}`) return;
+    this.waits = `${what}${uploaded}`;
+    this.through.hidden = !what;
+    const button = (text, onclick) => h("button", {class: "primary", onclick}, t(text));
+    const complete = uploaded ? button("complete_now", () => this.complete(true)) : null;
+    fill(this.through, {
+      failed: () => [h("span", {}, t("failed_why")), button("retry", () => this.again("retry"))],
+      resume: () => [h("span", {}, t("resume", number(uploaded), number(expected))), h("label", {class: "button", for: "more"}, t("resume_choose")), complete],
+      helped: () => [h("span", {}, t("helped")), button("compute_again", () => this.again("copy"))],
+      through: () => [h("span", {}, t("through", number(uploaded))), complete],
+    }[what]?.() ?? []);
   }
 
   drawFrame() {
@@ -301,11 +314,16 @@ export class FlightView {
     this.shown = result;
     this.frameTitle.textContent = result.file || t("frame_number", number(result.frame_id));
     this.newestButton.setAttribute("aria-pressed", String(this.selected === null));
-    this.frame.show(`/flights/${this.flightId}/frames/${result.frame_id}/image`, t("frame_alt", number(result.frame_id)));
+    this.frame.show(`/flights/${this.flightId}/frames/${result.frame_id}/image`, t("frame_alt", number(result.frame_id)), this.topOf(result));
     const verdict = model.verdicts.findLast((one) => one.frame_id === result.frame_id && one.measurement === "map");
     fill(this.frameFacts, sign(result.source), h("span", {}, t(`source_${result.source || "none"}`)),
       h("span", {}, result.match ? t("match_line", t(`verdict_${result.match}`), result.inliers ? t("inliers", number(result.inliers)) : "") : t("no_match")),
       verdict && verdict.detail ? h("span", {class: "soft"}, words(verdict.detail)) : null, result.file ? h("span", {class: "soft"}, t("frame_number", number(result.frame_id))) : null, result.error ? h("span", {class: "error"}, words(result.error)) : null);
+  }
+
+  /** Heading of the top of an image, of a camera that looks down: that of the vehicle and of the mount. */
+  topOf(result) {
+    return (result?.heading ?? null) === null ? null : (result.heading + (this.mountYaw ?? 0)) % 360;
   }
 
   select(id) {
@@ -348,9 +366,13 @@ export class FlightView {
   help() {
     if (this.ask) return;
     const request = this.model.request ?? {frame_id: this.shown.frame_id, candidate_tiles: []};
-    this.ask = new AskView(this.model.flight, request, this.info);
+    this.ask = new AskView(this.model.flight, request, this.info, this.topOf(this.model.results.get(request.frame_id)));
     this.ask.onClosed = () => { this.ask = null; };
-    this.ask.onSent = (path, body) => this.mapView.addMark(body, body.radius_m ?? 5);
+    this.ask.onSent = (path, body) => {
+      this.mapView.addMark(body, body.radius_m ?? 5);
+      this.helped = true;
+      this.dirty = true;
+    };
     this.ask.open();
   }
 
@@ -364,20 +386,32 @@ export class FlightView {
     }
   }
 
-  async addPhotos() {
-    const all = [...this.more.files];
-    this.more.value = "";
-    const files = inOrder(all.filter((file) => !file.name.endsWith(".csv")));
-    const tables = all.filter((file) => file.name.endsWith(".csv"));
+  /** Further photos, or the same ones again after an upload that was broken off: those that are there are left out. */
+  async addPhotos(files) {
     try {
-      if (files.length < BATCH[0]) throw new Error(t("too_few", BATCH[0]));
-      const table = tables.length ? readTable(await tables[0].text(), files) : null;
-      const next = (await get(`/flights/${this.flightId}`)).images.next_number;
-      const fits = isSequence(files.map((file) => file.name), next);
-      if (!fits && !confirm(t("renumber_sure", number(next ?? 1)))) return;
-      const running = startUpload(this.flightId, files, table, fits ? null : next ?? 1);
+      const found = await sorted(files);
+      this.more.value = "";
+      const {last_name: last} = (await get(`/flights/${this.flightId}`)).images;
+      const photos = found.photos.filter((photo) => last === null || compareNames(photo.name, last) > 0);
+      if (!photos.length) throw new Error(t("all_there", last));
+      if (photos.length < BATCH[0]) throw new Error(t("too_few", BATCH[0]));
+      const table = found.table === null ? null : readTable(found.table, photos);
+      const running = startUpload(this.flightId, photos, table);
       this.draw();
       if (!await running) toast(t("upload_failed"), true);
+    } catch (error) {
+      toast(error.message, true);
+    }
+  }
+
+  /** The same flight again, with the positions that were given meanwhile; or what has failed is tried again. */
+  async again(path) {
+    try {
+      const {flight} = path === "copy" ? await get(`/flights/${this.flightId}/config`) : {};
+      const made = await post(`/flights/${this.flightId}/${path}`, flight);
+      if (path === "retry") this.model.refresh(made);
+      else location.hash = `#/flight/${made.flight_id}`;
+      this.draw();
     } catch (error) {
       toast(error.message, true);
     }

@@ -80,7 +80,7 @@ async function route() {
   const main = h("main", {id: "main"});
   fill(app, bar(), main);
   const middle = document.getElementById("bar-middle");
-  const opened = kind === "flight" && id ? new FlightView(main, middle, id) : kind === "new" && mayAct() ? new NewView(main) : new ListView(main);
+  const opened = kind === "flight" && id ? new FlightView(main, middle, id) : kind === "new" && mayAct() ? new NewView(main, id) : new ListView(main);
   view = opened;
   document.title = "Terrafix";
   try {

@@ -35,6 +35,8 @@ const LINES = [
   ["accuracy {} m is worse than {} m", "accuracy of {0} m, the limit is {1} m", "Genauigkeit {0} m, die Grenze ist {1} m"],
   ["speed accuracy {} m/s is worse than {} m/s", "speed known to {0} m/s only, the limit is {1} m/s", "Geschwindigkeit nur auf {0} m/s bekannt, die Grenze ist {1} m/s"],
   // what became of a given position
+  ["no photo says its focal length; write a flight.toml with [camera] beside the photos", "no photo says its focal length: give it below", "kein Foto gibt die Brennweite an: unten angeben"],
+  ["all images are computed; it is used with the next images, or when the flight is computed again", "all photos are computed: compute the flight again to use it", "alle Fotos sind berechnet: den Flug erneut berechnen, um sie zu verwenden"],
   same("used with the next frame; hint_answered tells what came of it", "wird mit dem nächsten Bild verwendet; das Ergebnis steht unter Ereignisse"),
   same("the position is lost and the whole map was searched; a user fix or a hint would help", "die Position ist verloren, und die ganze Karte wurde durchsucht; eine angegebene Position würde helfen"),
   same("all images are computed and the position is not found; a user fix or a hint would help", "alle Bilder sind berechnet, und die Position ist nicht gefunden; eine angegebene Position würde helfen"),
