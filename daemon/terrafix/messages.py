@@ -146,7 +146,8 @@ class Origin(Message, frozen=True, kw_only=True):
 
 
 class Fact(NamedTuple):
-    topic: str  # "camera", "mount", "start", "height", "heading", "tilt", "clock", "exposure", "rate", "vehicles", "left out"
+    # "camera", "mount", "start", "height", "heading", "tilt", "clock", "exposure", "rate", "vehicles", "left out"
+    topic: str
     text: str
 
 
