@@ -17,14 +17,15 @@ from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameInput, FrameState
 from terrafix.estimator.initialization import ResetReason
 from terrafix.estimator.integrity.camera_vehicle import CameraVehicleTest
-from terrafix.estimator.integrity.innovation import FusionVerdict
-from terrafix.estimator.integrity.time_offset import TimeOffset
+from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
+from terrafix.estimator.integrity.time_offset import Contradiction, TimeOffset
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
 from terrafix.estimator.measurements.odometry import NO_NEW_VIEW, without_ground
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
+from terrafix.estimator.monitors.refused_pictures import RefusedPictures
 from terrafix.estimator.output import (
     calibration_of,
     estimate_of,
@@ -120,6 +121,7 @@ class EstimatorNode:
         self._relocated = False  # a relocalisation has moved the estimate since
         self._monitors: Monitors | None = None
         self._rebuilds = 0  # of the graph
+        self._refused = RefusedPictures()
         self._start_moved = False  # as reported
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
             Origin: self._on_origin,
@@ -340,12 +342,19 @@ class EstimatorNode:
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
             # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground anyhow.
-            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground
+            jump = estimator.state.image_jump
+            if jump is not None and jump[0] == frame.t_s and not estimator.state.orientation.suspects:
+                self._time_contradicted(stamped.t_ns, jump[1], result.placed, by_map=False)
+            # On the ground the wander of the attitude is all that there is.
+            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground or frame.attitude.stands
             if estimator.state.orientation.suspects or untimed:
                 time_offset.forget_images()
             else:
                 time_offset.add(stamped, self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
+        named = estimator.state.orientation.fault is not None or time_offset.is_wrong
+        if not frame.attitude.stands:  # a camera on the ground is out of focus
+            yield from self._refused.add(odometry.t_ns, Verdict.ACCEPTED if named else result.verdict)
         yield from self._start_fault(estimator, odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:
@@ -355,6 +364,13 @@ class EstimatorNode:
             self._ahrs.position_published(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
         yield from odometry_link(estimator, result, odometry.t_ns)  # last: it delays nothing
+
+    def _time_contradicted(self, t_ns: int, off: Innovation, frame: FrameState, *, by_map: bool) -> None:
+        """``off``: a frame at the uncorrected ``t_ns`` the estimate; ``frame``: the newest one."""
+        assert self._flight is not None
+        agl_m = max(self._flight.estimator.terrain.height_above_m(frame.pose.translation()), 1.0)
+        seen = Contradiction(t_ns, off, frame.velocity_mps[:2], agl_m)
+        self._flight.time_offset.contradict(seen, self._telemetry, by_map=by_map)
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved
@@ -481,6 +497,12 @@ class EstimatorNode:
         yield from (verdict_of(match.t_ns, match.frame_id, verdict, fragment) for verdict in verdicts)
         yield outcome.solution
         accepted = result.verdict is Verdict.ACCEPTED
+        if accepted:
+            flight.time_offset.agree()
+        elif result.off is not None and estimator.last is not None:
+            stamp_ns = match.t_ns + round(flight.time_offset.applied_s * 1e9)
+            self._time_contradicted(stamp_ns, result.off, estimator.last, by_map=True)
+            yield from flight.time_offset.take_changes(match.t_ns)
         if self._monitors is not None:
             yield from self._monitors.take_changes(match.t_ns)
         changed = accepted or was_multimodal or estimator.hypotheses.is_multimodal or result.verdict is Verdict.LOST
