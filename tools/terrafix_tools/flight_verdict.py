@@ -23,7 +23,7 @@ MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejec
 # Faults that begin in flight; all others are of the description, which was wrong from the beginning.
 BEGIN_IN_FLIGHT = ("registration", "picture upside down", "picture turned", "picture mirrored")
 # Faults whose pictures were refused: the position went on without them, at a claim of its own.
-REFUSED = ("picture frozen", "picture of another place", "picture without texture")
+REFUSED = ("picture frozen", "picture contradicts motion", "picture without texture")
 # One of map and initial position is wrong; no measurement on board decides which.
 START_CONTRADICTS_MAP = "start and map contradict each other: one of them is in the wrong place"
 MAX_SHOWN_SPANS = 3

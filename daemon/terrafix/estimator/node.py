@@ -14,7 +14,7 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.claim import Claim
 from terrafix.estimator.edge import EstimatorEdge
 from terrafix.estimator.estimator import Estimator
-from terrafix.estimator.filter_state import FrameInput, FrameState
+from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState
 from terrafix.estimator.initialization import ResetReason
 from terrafix.estimator.integrity.camera_vehicle import CameraVehicleTest
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
@@ -352,9 +352,7 @@ class EstimatorNode:
             else:
                 time_offset.add(stamped, self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
-        named = estimator.state.orientation.fault is not None or time_offset.is_wrong
-        if not frame.attitude.stands:  # a camera on the ground is out of focus
-            yield from self._refused.add(odometry.t_ns, Verdict.ACCEPTED if named else result.verdict)
+        yield from self._refused_pictures(odometry.t_ns, result.verdict, estimator.state, frame.attitude)
         yield from self._start_fault(estimator, odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:
@@ -371,6 +369,18 @@ class EstimatorNode:
         agl_m = max(self._flight.estimator.terrain.height_above_m(frame.pose.translation()), 1.0)
         seen = Contradiction(t_ns, off, frame.velocity_mps[:2], agl_m)
         self._flight.time_offset.contradict(seen, self._telemetry, by_map=by_map)
+
+    def _refused_pictures(
+        self, t_ns: int, verdict: Verdict, state: FilterState, attitude: Attitude
+    ) -> Iterable[Message]:
+        """Faults of pictures that are refused for no reason that has a name already."""
+        assert self._flight is not None
+        if attitude.stands:  # a camera on the ground is out of focus
+            return ()
+        if verdict is Verdict.UNCONFIRMED and not state.continuity.last_increment_inertial:
+            return ()  # nothing says how the vehicle moves
+        named = state.orientation.fault is not None or self._flight.time_offset.is_wrong
+        return self._refused.add(t_ns, Verdict.ACCEPTED if named else verdict)
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved

@@ -1,4 +1,4 @@
-"""Why pictures are not used for seconds: frozen ones, those of another place or time, and those that show nothing.
+"""Why pictures are not used for seconds: frozen ones, those of another flight, and those that show nothing.
 
 Each frame has its verdict at once, and refused pictures move nothing; this names the cause of a run of them, as a fault
 that begins with its first frame."""
@@ -7,18 +7,18 @@ from collections import Counter
 
 from terrafix.messages import CalibrationFault, Verdict
 
-FROZEN, ELSEWHERE, EMPTY = "picture frozen", "picture of another place", "picture without texture"
+FROZEN, OTHER, EMPTY = "picture frozen", "picture contradicts motion", "picture without texture"
 KINDS = {
     Verdict.STALLED: FROZEN,
-    Verdict.IMPLAUSIBLE: ELSEWHERE,  # it agrees with itself, and not with this flight
-    Verdict.UNCONFIRMED: ELSEWHERE,
+    Verdict.IMPLAUSIBLE: OTHER,  # it agrees with itself, and not with this flight
+    Verdict.UNCONFIRMED: OTHER,
     Verdict.FEW_INLIERS: EMPTY,
     Verdict.NO_FEATURES: EMPTY,
     Verdict.DEGENERATE: EMPTY,
 }
 DETAILS = {
     FROZEN: "the camera repeats a picture while the vehicle moves: check camera and stream",
-    ELSEWHERE: "the pictures agree with each other, and not with the motion of this flight: check which stream it is",
+    OTHER: "the pictures agree with each other, and not with the motion of this flight: check which stream it is",
     EMPTY: "too few matches from picture to picture, as over water, in cloud or in the dark",
 }
 # ns and frames without a used picture; used pictures in a row that end it. [spec: allowed to a wrong fix, score.py]

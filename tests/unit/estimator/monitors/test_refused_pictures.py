@@ -2,7 +2,7 @@
 
 import pytest
 
-from terrafix.estimator.monitors.refused_pictures import ELSEWHERE, EMPTY, FROZEN, RefusedPictures
+from terrafix.estimator.monitors.refused_pictures import EMPTY, FROZEN, OTHER, RefusedPictures
 from terrafix.link.pilot_text.statustext import fault_text
 from terrafix.messages import CalibrationFault, Verdict
 
@@ -17,7 +17,7 @@ def told(*verdicts: Verdict) -> list[CalibrationFault]:
     ("verdicts", "quantity"),
     [
         ([Verdict.STALLED] * 7, FROZEN),
-        ([Verdict.FEW_INLIERS, Verdict.IMPLAUSIBLE, *[Verdict.UNCONFIRMED] * 6], ELSEWHERE),
+        ([Verdict.FEW_INLIERS, Verdict.IMPLAUSIBLE, *[Verdict.UNCONFIRMED] * 6], OTHER),
         ([Verdict.FEW_INLIERS] * 8, EMPTY),
     ],
 )
