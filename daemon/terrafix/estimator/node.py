@@ -18,6 +18,7 @@ from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState
 from terrafix.estimator.initialization import ResetReason
 from terrafix.estimator.integrity.camera_vehicle import CameraVehicleTest
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
+from terrafix.estimator.integrity.offset_drift import STEP_S
 from terrafix.estimator.integrity.time_offset import Contradiction, TimeOffset
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
@@ -318,6 +319,10 @@ class EstimatorNode:
         if (camera_vehicle := self._camera_vehicle.on_odometry(odometry, self._estimator.origin.camera)) is not None:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
+        newest = self._estimator.last
+        if newest is not None and odometry.t_ns * 1e-9 < newest.t_s + STEP_S:  # by an offset that has jumped
+            yield odometry_verdict(odometry, Verdict.STALE, "taken before the newest frame")
+            return
         estimator, frame = self._frame_input(self._estimator, odometry)
         odometry = frame.odometry
         follows = not self._relocated and self._note_predicted_frame(estimator)

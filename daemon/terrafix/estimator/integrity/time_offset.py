@@ -155,6 +155,7 @@ class TimeOffset:
         # Offset with which position and images agreed at last, where they do not now; what has contradicted since.
         self._agreed_s: float | None = None
         self._contradicted: set[str] = set()
+        self._jumps = False  # what has contradicted is known, and not subtracted yet
 
     def stamped(self, frame: Frame) -> None:
         """How its source stamps ``frame``: the prior until a first image is compared, and how often an offset begins to
@@ -187,7 +188,7 @@ class TimeOffset:
 
     def agree(self) -> None:
         """The map has confirmed the position, or moved it to where the images are."""
-        self._agreed_s, self._contradicted = None, set()
+        self._agreed_s, self._contradicted, self._jumps = None, set(), False
 
     def contradict(self, seen: Contradiction, telemetry: Telemetry, *, by_map: bool) -> None:
         """An offset that jumps moves the image along the way that was flown. A wrong motion of images lies along it,
@@ -207,6 +208,7 @@ class TimeOffset:
         if not by_map:
             anywhere = 0.5 * (anywhere + seen.density_across / (2.0 * seen.agl_m))
         mass *= jumped + rate * anywhere
+        self._jumps = True
         self._mass, self._at_ns, self._density = mass / mass.sum(), max(seen.t_ns, self._at_ns or seen.t_ns), None
 
     @property
@@ -238,7 +240,8 @@ class TimeOffset:
 
     def step(self, dt_s: float) -> None:
         """Moves ``applied_s`` towards the estimate where that is known and not 0, towards 0 where it is 0; elsewhere it
-        stays. ``dt_s``: since the last frame."""
+        stays. An offset that has jumped is subtracted at once: on the way there images would show more motion than the
+        time between them. ``dt_s``: since the last frame."""
         far, target_s = self._far(0.0), self.applied_s
         median_s = GRID_S[np.searchsorted(np.cumsum(self.density), 0.5)]
         near = np.where(np.abs(GRID_S - median_s) <= KNOWN_S, self.density, 0.0)
@@ -246,8 +249,11 @@ class TimeOffset:
             target_s = float(near @ GRID_S / near.sum())
         elif far <= 0.5:
             target_s = 0.0
+        off_s = target_s - self.applied_s
         max_step_s = MAX_SLEW * max(dt_s, 0.0)
-        self.applied_s += float(np.clip(target_s - self.applied_s, -max_step_s, max_step_s))
+        if self._jumps and abs(off_s) > FAR_S:
+            self._jumps, max_step_s = False, abs(off_s)
+        self.applied_s += float(np.clip(off_s, -max_step_s, max_step_s))
 
     @property
     def is_wrong(self) -> bool:
