@@ -9,6 +9,7 @@ import numpy as np
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
+from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.claim import Claim
@@ -347,14 +348,15 @@ class EstimatorNode:
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
             # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground anyhow.
+            # Near the ground images move by more than their error, and on it the attitude wanders alone.
+            low = frame.attitude.stands or agl_m < MIN_MATCHING_AGL_M
+            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground or low
             jump = estimator.state.image_jump
-            if jump is not None and jump[0] == frame.t_s and not estimator.state.orientation.suspects:
-                self._time_contradicted(stamped.t_ns, jump[1], result.placed, by_map=False)
-            # On the ground the wander of the attitude is all that there is.
-            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground or frame.attitude.stands
             if estimator.state.orientation.suspects or untimed:
                 time_offset.forget_images()
             else:
+                if jump is not None and jump[0] == frame.t_s:
+                    self._time_contradicted(stamped.t_ns, jump[1], result.placed, by_map=False)
                 time_offset.add(stamped, self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
         yield from self._refused_pictures(odometry.t_ns, result.verdict, estimator.state, frame.attitude)

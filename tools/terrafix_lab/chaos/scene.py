@@ -52,7 +52,7 @@ class ChaosScene:
 
     def begin_s(self, phase: Phase, lasts_s: float) -> float:
         """Second of the flight at which a fault begins, so early that a flight without a landing goes on after it."""
-        if Phase.LANDING in self.at_s:
+        if Phase.LANDING in self.at_s or self.disarmed:
             return self.at_s[phase]
         return max(LEAD_S, min(self.at_s[phase], self.duration_s - lasts_s - AFTER_S))
 
