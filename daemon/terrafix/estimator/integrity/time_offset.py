@@ -14,8 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.core.agreement import P_REJECTED
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.core.pose import log_so3
+from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.offset_drift import (
     DRIFT_GRID_S,
     RATES,
@@ -57,10 +59,51 @@ MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
 MAX_VELOCITY_GAP_S = 2.0
 MAX_NATS = 6.0  # of one comparison: twice MAX_STEP of the monitors [spec: monitors/cusum.py]
 REPORT_WAIT_NS = 250_000_000  # ns beyond the grid until all attitudes have arrived: two periods at 8 Hz [tuned]
-APPLY_MAX_SIGMA_S = 0.25  # s: largest 1-sigma of an offset that is applied [tuned]
+# Probability of a motion of images that is implausible, in a frame of a flight whose offset is constant.
+P_IMPLAUSIBLE = 1e-3  # [measured: none in 2000 frames, docs/decisions/058]
+KNOWN_S = 0.5  # s: an offset that is applied lies within this of the median, two of its largest 1-sigma [tuned]
 MAX_SLEW = 0.2  # s/s: rate of change of the applied offset [tuned]
 REPORT_EVERY_S = 0.5  # s: change of a reported offset that is reported again [spec: 10 m at 20 m/s]
 QUANTITY = "camera time"
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A frame at the uncorrected ``t_ns``, which images or map place ``off`` the estimate (2,), which moves with
+    ``velocity_mps`` (2,) at ``agl_m`` above the ground."""
+
+    t_ns: int
+    off: Innovation
+    velocity_mps: np.ndarray
+    agl_m: float
+
+    def back_m(self, agreed_s: float, telemetry: Telemetry) -> np.ndarray:
+        """(2, L): from the place at each offset to that at the offset ``agreed_s``, with which the estimate agrees."""
+        mps = np.full(len(DRIFT_GRID_S), complex(*self.velocity_mps))
+        if (varied := telemetry.velocities(self.t_ns, DRIFT_GRID_S)) is not None:
+            mps += varied - np.interp(agreed_s, DRIFT_GRID_S, varied)
+        way_m = np.concatenate([[0.0], np.cumsum(0.5 * (mps[1:] + mps[:-1]) * np.diff(DRIFT_GRID_S))])
+        way_m -= np.interp(agreed_s, DRIFT_GRID_S, way_m)
+        return np.stack([way_m.real, way_m.imag])
+
+    @property
+    def _cov_m2(self) -> np.ndarray:
+        return np.asarray(self.off.covariance + RESOLUTION_S2 * np.outer(self.velocity_mps, self.velocity_mps))
+
+    def density(self, back_m: np.ndarray) -> np.ndarray:
+        """(L,) likelihood [1/m^2] of each offset, ``back_m`` (2, L)."""
+        off_m = self.off.residual[:, None] + back_m
+        distance2 = np.sum(off_m * np.linalg.solve(self._cov_m2, off_m), axis=0)
+        return np.asarray(np.exp(-0.5 * distance2) / (2.0 * np.pi * np.sqrt(np.linalg.det(self._cov_m2))))
+
+    @property
+    def density_across(self) -> float:
+        """Likelihood [1/m] of a wrong motion along the velocity."""
+        speed_mps = float(np.hypot(*self.velocity_mps))
+        east, north = self.velocity_mps / speed_mps if speed_mps > 0.0 else np.array([1.0, 0.0])
+        across = np.array([-north, east])
+        variance_m2 = float(across @ self._cov_m2 @ across)
+        return float(np.exp(-0.5 * (across @ self.off.residual) ** 2 / variance_m2) / np.sqrt(2 * np.pi * variance_m2))
 
 
 @dataclass(frozen=True)
@@ -112,6 +155,10 @@ class TimeOffset:
         self._compared = FIRST_GUESS  # comparisons that both rest on
         self._density: np.ndarray | None = None  # of the newest frame
         self._reported_s: float | None = None
+        # Offset with which position and images agreed at last, where they do not now; what has contradicted since.
+        self._agreed_s: float | None = None
+        self._contradicted: set[str] = set()
+        self._jumps = False  # what has contradicted is known, and not subtracted yet
 
     def stamped(self, frame: Frame) -> None:
         """How its source stamps ``frame``: the prior, until a first image is compared or exposures are reported, and
@@ -139,6 +186,31 @@ class TimeOffset:
             self._compare(*self._pending.popleft(), telemetry)
         while self._pending and self._pending[0][0].t_ns + 2 * reach_ns < odometry.t_ns:  # no attitude is reported
             self._pending.popleft()
+
+    def agree(self) -> None:
+        """The map has confirmed the position, or moved it to where the images are."""
+        self._agreed_s, self._contradicted, self._jumps = None, set(), False
+
+    def contradict(self, seen: Contradiction, telemetry: Telemetry, *, by_map: bool) -> None:
+        """An offset that jumps moves the image along the way that was flown. A wrong motion of images lies along it,
+        too, or anywhere, as a wrong pose on the map does (``by_map``). The first of each counts: those that follow
+        repeat it."""
+        kind, rate = ("map", P_REJECTED) if by_map else ("images", P_IMPLAUSIBLE)
+        if kind in self._contradicted or (abs(self.estimate[0] - self.applied_s) > FAR_S and not self._contradicted):
+            return  # a correction that is under way moves the frames as well
+        self._contradicted.add(kind)
+        if self._agreed_s is None:
+            self._agreed_s = self.estimate[0]
+        self.forget_images()
+        since_s = 0.0 if self._at_ns is None else (seen.t_ns - self._at_ns) * 1e-9
+        mass = predicted(self._mass, since_s, self._hazards)
+        jumped = seen.density(seen.back_m(self._agreed_s, telemetry))
+        anywhere = 1.0 / (2.0 * seen.agl_m) ** 2  # in what the camera sees
+        if not by_map:
+            anywhere = 0.5 * (anywhere + seen.density_across / (2.0 * seen.agl_m))
+        mass *= jumped + rate * anywhere
+        self._jumps = True
+        self._mass, self._at_ns, self._density = mass / mass.sum(), max(seen.t_ns, self._at_ns or seen.t_ns), None
 
     @property
     def density(self) -> np.ndarray:
@@ -169,15 +241,25 @@ class TimeOffset:
 
     def step(self, dt_s: float) -> None:
         """Moves ``applied_s`` towards the estimate where that is known and not 0, towards 0 where it is 0; elsewhere it
-        stays. ``dt_s``: since the last frame."""
-        mean_s, sigma_s = self.estimate
+        stays. An offset that has jumped is subtracted at once: on the way there images would show more motion than the
+        time between them. ``dt_s``: since the last frame."""
         far, target_s = self._far(0.0), self.applied_s
-        if far >= 1.0 - MIN_COMPONENT_WEIGHT and sigma_s < APPLY_MAX_SIGMA_S:
-            target_s = mean_s
+        median_s = DRIFT_GRID_S[np.searchsorted(np.cumsum(self.density), 0.5)]
+        near = np.where(np.abs(DRIFT_GRID_S - median_s) <= KNOWN_S, self.density, 0.0)
+        if min(far, float(near.sum())) >= 1.0 - MIN_COMPONENT_WEIGHT:
+            target_s = float(near @ DRIFT_GRID_S / near.sum())
         elif far <= 0.5:
             target_s = 0.0
+        off_s = target_s - self.applied_s
         max_step_s = MAX_SLEW * max(dt_s, 0.0)
-        self.applied_s += float(np.clip(target_s - self.applied_s, -max_step_s, max_step_s))
+        if self._jumps and abs(off_s) > FAR_S:
+            self._jumps, max_step_s = False, abs(off_s)
+        self.applied_s += float(np.clip(off_s, -max_step_s, max_step_s))
+
+    @property
+    def is_wrong(self) -> bool:
+        """An offset is known that is not corrected yet."""
+        return self._reported_s is not None
 
     def take_changes(self, t_ns: int) -> list[CalibrationFault]:
         """The fault of an offset that is not corrected, where it has begun, changed or ended since the last call."""
@@ -187,10 +269,12 @@ class TimeOffset:
             return []
         if before_s is not None and active and abs(mean_s - before_s) < REPORT_EVERY_S:
             return []
+        if active and abs(mean_s) <= FAR_S:
+            return []  # what was subtracted is on its way back
         if before_s is not None and not active and self._far(self.applied_s) >= MIN_COMPONENT_WEIGHT:
             return []  # not sure yet
         self._reported_s = mean_s if active else None
-        now_s = mean_s if active else self.applied_s
+        now_s = mean_s if active else self.applied_s if abs(self.applied_s) > FAR_S else 0.0
         detail = "images show roll, pitch and turns at another time than the autopilot reports them"
         if not active:
             detail = "it is subtracted from the time stamps" if now_s else "images and attitude agree in time"

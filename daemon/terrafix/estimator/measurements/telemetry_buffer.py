@@ -217,14 +217,27 @@ class Telemetry:
         """(N,) complex, east + j north [m/s]: change of velocity from ``t0_ns`` to ``t1_ns``, both less each of
         ``offset_s`` (N,). None when readings or attitudes do not cover that."""
         first_ns, last_ns = t0_ns - round(offset_s.max() * 1e9), t1_ns - round(offset_s.min() * 1e9)
-        world = self.world_acceleration(first_ns, last_ns)
+        known = self._velocities(first_ns, last_ns)
+        if known is None:
+            return None
+        before, after = (np.interp((t_ns - first_ns) * 1e-9 - offset_s, *known) for t_ns in (t0_ns, t1_ns))
+        return np.asarray(after - before)
+
+    def velocities(self, t_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
+        """(N,) complex, east + j north [m/s]: velocity at ``t_ns`` less each of ``offset_s`` (N,), but for a constant;
+        the newest one for times that come later. None when readings or attitudes do not cover that."""
+        first_ns, last_ns = t_ns - round(offset_s.max() * 1e9), t_ns - round(offset_s.min() * 1e9)
+        known = self._velocities(first_ns, min(last_ns, self._forces.newest_ns, self._turns.newest_ns))
+        return None if known is None else np.interp((t_ns - first_ns) * 1e-9 - offset_s, *known)
+
+    def _velocities(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """-> seconds since ``t0_ns`` (M,), and by how much the velocity has changed since then (M,), complex."""
+        world = self.world_acceleration(t0_ns, t1_ns)
         if world is None:
             return None
         accel_mps2 = world.accel_w_mps2[:, 0] + 1j * world.accel_w_mps2[:, 1]
-        mps = np.concatenate([[0.0], np.cumsum(0.5 * (accel_mps2[1:] + accel_mps2[:-1]) * np.diff(world.s_s))])
-        ends = (np.interp((t_ns - first_ns) * 1e-9 - offset_s, world.s_s, mps) for t_ns in (t0_ns, t1_ns))
-        before, after = ends
-        return np.asarray(after - before)
+        mps = np.cumsum(0.5 * (accel_mps2[1:] + accel_mps2[:-1]) * np.diff(world.s_s))
+        return world.s_s, np.concatenate([[0.0], mps])
 
     def turns_by_gyro(self, t0_ns: int, t1_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
         """(N, 3): rotation of the vehicle about east, north and up [rad] from ``t0_ns`` to ``t1_ns``, both less each of

@@ -9,9 +9,11 @@ from inertial_flight import ORIGIN as INERTIAL_ORIGIN
 from inertial_flight import InertialFlight
 from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of, t_ns
 from terrafix.core.camera import Mount
+from terrafix.core.gate import GATE
 from terrafix.core.geodesy import LocalFrame
+from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.offset_drift import DRIFT_GRID_S, RATES, Hazards, predicted
-from terrafix.estimator.integrity.time_offset import MAX_SLEW, TimeOffset
+from terrafix.estimator.integrity.time_offset import MAX_SLEW, Contradiction, TimeOffset
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.pose_estimator import EstimatedFlight
 from terrafix.messages import (
@@ -243,3 +245,25 @@ def test_the_prior_of_the_offset_is_what_the_source_knows_of_its_stamps(sigma_s:
     offset.stamped(Frame(t_ns=0, frame_id=0, file="", width=1, height=1, buffered=True, stamp_sigma_s=sigma_s))
     assert offset.buffered and offset.applied_s == 0.0
     assert sigma_s <= offset.sigma_s <= 1.5 * sigma_s  # 1 % of the cameras may be off by anything
+
+
+@pytest.mark.parametrize(("off_m", "late_s"), [((-28.0, 0.5), 1.4), ((28.0, 0.5), -1.4), ((-0.5, 28.0), 0.0)])
+def test_an_image_that_jumps_along_the_track_is_one_of_another_time_and_one_beside_it_is_not(
+    off_m: tuple[float, float], late_s: float
+) -> None:
+    """A plane with 20 m/s to the east; the map repeats what the images show."""
+    offset = TimeOffset(R_B_C)
+    offset.buffered = True
+    off = Innovation(np.array(off_m), np.eye(2), GATE[2])
+    for by_map in (False, True):
+        offset.contradict(Contradiction(0, off, np.array([20.0, 0.0]), 120.0), Telemetry(), by_map=by_map)
+    assert offset.estimate[0] == pytest.approx(late_s, abs=0.1)
+    (fault,) = offset.take_changes(0) or (None,)
+    assert (fault is not None and fault.active) == (late_s != 0.0)
+
+
+def test_a_vehicle_that_hovers_learns_nothing_of_the_time_from_an_image_that_jumps() -> None:
+    offset, before = TimeOffset(R_B_C), TimeOffset(R_B_C)
+    off = Innovation(np.array([-20.0, 0.0]), np.eye(2), GATE[2])
+    offset.contradict(Contradiction(0, off, np.zeros(2), 120.0), Telemetry(), by_map=False)
+    assert offset.density == pytest.approx(before.density)
