@@ -139,7 +139,7 @@ class TelemetryLog:
         """Times of the exposures of each kind, the preferred one first, in order. With the time of the autopilot's
         clock they are as far apart as on it, and arrive as the fastest of them."""
         found: dict[str, list[tuple[int, int | None]]] = {kind: [] for kind in EXPOSURE_KINDS}
-        for t_us, message in self.messages(exposure.MESSAGE_IDS):
+        for t_us, message in self.messages(exposure.EXPOSURE_MESSAGE_IDS):
             if (read := exposure.exposure_of(message)) is not None:
                 found[read[0]].append(((t_us - self.t0_us) * 1000, read[2]))
         times: dict[str, list[int]] = {}

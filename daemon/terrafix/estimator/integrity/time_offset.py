@@ -51,7 +51,7 @@ GYRO_SIGMA_RAD, ATTITUDE_SIGMA_RAD, MIN_OFFSET_TURN_SIGMA_RAD = np.radians(0.3),
 # 1-sigma of the mount's tilt, by which a turn looks like a roll [spec: twice that of turn_comparison.py]
 MOUNT_SIGMA_RAD = np.radians(3.0)
 # The images alone determine the tilt between two frames: the attitude only selects one of two mirror solutions.
-TILT_SIGMA_RAD = np.radians(10.0)  # [spec: beyond the lean of a vehicle within an offset of the grid]
+MIRROR_TILT_SIGMA_RAD = np.radians(10.0)  # [spec: beyond the lean of a vehicle within an offset of the grid]
 HEIGHT_SHARE = 0.1  # 1-sigma of the height, share of it: rotations do not depend on it [tuned]
 # Least share of the noise that the images have. Without a limit two of three healthy flights had a false offset.
 MIN_NOISE_SHARE = 0.5  # [measured: docs/decisions/058]
@@ -329,7 +329,7 @@ class TimeOffset:
         at = int(np.argmax(self._mass.sum(axis=0)))
         cameras = [r_w_b[at] @ self._r_b_c for r_w_b in bodies]
         ground, pairs = Ground(agl_m, HEIGHT_SHARE * agl_m), np.array(odometry.two_view)
-        motion = relative_pose(pairs, odometry.sigma_norm, cameras[0], cameras[1], TILT_SIGMA_RAD, ground)
+        motion = relative_pose(pairs, odometry.sigma_norm, cameras[0], cameras[1], MIRROR_TILT_SIGMA_RAD, ground)
         if motion is None:
             return None
         turned_rad, moved_m = cameras[0] @ log_so3(motion.r), cameras[0] @ motion.p_m
