@@ -29,7 +29,7 @@ def init(
     link: Annotated[str, typer.Option(help="Connection to the autopilot.")] = "",
 ) -> None:
     """The files of a vehicle: configuration, camera description, parameters, checklist. Asks for what is missing."""
-    from terrafix_tools.configuration.first_files import Answers, Vehicle, write_first_files
+    from terrafix_tools.configuration.first_files import FirstAnswers, Vehicle, write_first_files
     from terrafix_tools.installation import command
 
     given = {"vehicle": vehicle, "camera": camera, "link": link}
@@ -40,7 +40,7 @@ def init(
         raise UsageError(f"--vehicle {answers['vehicle']}: choose one of {', '.join(Vehicle)}")
     files = write_first_files(
         folder,
-        Answers(
+        FirstAnswers(
             vehicle=Vehicle(answers["vehicle"]),
             camera=answers["camera"],
             link=answers["link"],

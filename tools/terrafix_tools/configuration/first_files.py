@@ -29,7 +29,7 @@ class Vehicle(StrEnum):
 
 
 @dataclass(frozen=True)
-class Answers:
+class FirstAnswers:
     """``camera``: address of the camera. ``lens``: a camera description, or "" for ``size`` and ``fov_deg``."""
 
     vehicle: Vehicle
@@ -41,7 +41,7 @@ class Answers:
     fov_deg: float = 0.0
 
 
-def write_first_files(folder: Path, answers: Answers) -> list[Path]:
+def write_first_files(folder: Path, answers: FirstAnswers) -> list[Path]:
     """Writes the files, none of which may exist, and returns them. Raises UsageError, SourceError, OutputError."""
     files = [folder / name for name in (CONFIG_FILE, CAMERA_FILE, CHECKLIST)]
     files += [folder / PARAMETERS] if answers.vehicle is not Vehicle.PX4 else []
@@ -65,7 +65,7 @@ def write_first_files(folder: Path, answers: Answers) -> list[Path]:
     return files
 
 
-def _camera(answers: Answers) -> Camera:
+def _camera(answers: FirstAnswers) -> Camera:
     """Raises UsageError, SourceError."""
     if answers.lens:
         return camera_of(Path(answers.lens), read_description(Path(answers.lens)))
@@ -88,7 +88,7 @@ def _camera(answers: Answers) -> Camera:
     )
 
 
-def _lens_note(answers: Answers) -> str:
+def _lens_note(answers: FirstAnswers) -> str:
     if answers.lens:
         return f"from {answers.lens}"
     return f"field of view {answers.fov_deg:g} degrees, nominal: calibrate with '{command()} camera calibrate'"
@@ -98,7 +98,7 @@ def _with_schema(path: Path, kind: str) -> None:
     path.write_text(f"#:schema schema/{NAMES[kind]}\n{path.read_text(encoding='utf-8')}", encoding="utf-8")
 
 
-def _config(folder: Path, answers: Answers) -> str:
+def _config(folder: Path, answers: FirstAnswers) -> str:
     """Strings of JSON are valid TOML."""
 
     def text(value: object) -> str:
@@ -112,7 +112,7 @@ def _config(folder: Path, answers: Answers) -> str:
     )
 
 
-def _checklist(folder: Path, answers: Answers) -> str:
+def _checklist(folder: Path, answers: FirstAnswers) -> str:
     run, config = command(), folder / CONFIG_FILE
     firmware = answers.vehicle is not Vehicle.PX4
     steps = [
