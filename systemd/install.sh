@@ -53,6 +53,8 @@ if [ "$pip" = yes ]; then
     # Without libsystemd-dev and a compiler it cannot be built; the log is then JSON in the text of the journal.
     "$install" install --constraint "$here/../requirements.lock" "${package}[vehicle]" ||
         echo "install.sh: no systemd-python (apt install libsystemd-dev gcc pkg-config): the journal gets no fields" >&2
+    # The wheel of gtsam requires what tests it; nothing that flies imports that.
+    "$install" uninstall --yes pytest pluggy iniconfig
 fi
 
 install -D -m 0644 "$here/terrafix.service" "$prefix/etc/systemd/system/terrafix.service"

@@ -82,6 +82,14 @@ def test_what_flies_starts_without_faiss() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_what_flies_starts_without_the_tests_that_gtsam_brings() -> None:
+    """systemd/install.sh takes pytest away from a vehicle."""
+    without = "import sys; sys.modules.update(dict.fromkeys(('pytest', '_pytest', 'pluggy', 'iniconfig')))"
+    code = f"{without}; import terrafix.estimator.node, terrafix.smoother.node"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert "uninstall --yes pytest pluggy iniconfig" in (ROOT / "systemd" / "install.sh").read_text(encoding="utf-8")
+
+
 @pytest.mark.slow
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])

@@ -142,6 +142,26 @@ def export(
 
 
 @app.command()
+def layout(
+    out: Annotated[Path, typer.Argument(help="File to write (.json); not over another.")] = Path(
+        "terrafix-layout.json"
+    ),
+) -> None:
+    """The layout in which Foxglove shows a record: map, frames, claims, gates, states, log. Import it there."""
+    from terrafix.core.installed_files import installed_files
+
+    file = installed_files() / "config" / "foxglove" / "terrafix-layout.json"
+    try:
+        with out.open("xb") as stream:
+            stream.write(file.read_bytes())
+    except FileExistsError:
+        raise OutputError(f"{out}: exists, and is not overwritten; name another file") from None
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another folder") from None
+    typer.echo(f"written to {out}; Foxglove: Layouts, Import from file, then open the record")
+
+
+@app.command()
 def cut(record: RecordArgument, out: OutArgument, from_s: FromOption = 0.0, to_s: ToOption = float("inf")) -> None:
     """A record of the messages between two times."""
     from terrafix_tools.log.edit import cut as run_cut
