@@ -12,14 +12,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 from msgspec import UnsetType
-from pymavlink.dialects.v20 import common as mavlink
 
 from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix.core.geodesy import LocalFrame, euler_from_rot
-from terrafix.core.mavlink.gimbal import IN_EARTH, YAW_LOCK, quat_from_euler
+from terrafix.core.mavlink.gimbal import quat_from_euler
 from terrafix.estimator.measurements.gimbal import LOOKING_ALONG_X
+from terrafix.messages import Quat
 from terrafix.vision.sources.description import (
     CameraTable,
     Description,
@@ -96,18 +96,13 @@ class Flight:
         """Returns p_c_in_w_m (3,) and R_w_c (3, 3)."""
         return state.p_b_in_w_m, self.mount.r_w_c(state)
 
-    def gimbal_records(self) -> list[tuple[float, bytes]]:
-        """Time and packet of each report of the gimbal; empty where the camera is fixed."""
+    def gimbal_attitudes(self) -> list[tuple[float, Quat]]:
+        """Time and attitude of each report of the gimbal; empty where the camera is fixed."""
         if isinstance(self.camera.gimbal, UnsetType):
             return []
-        sender, times_s = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), np.arange(0, self.duration_s, GIMBAL_S)
-        return [(t_s, self._gimbal_report(t_s).pack(sender)) for t_s in times_s.tolist()]
-
-    def _gimbal_report(self, t_s: float) -> mavlink.MAVLink_gimbal_device_attitude_status_message:
-        """The x axis of a gimbal is that of its camera's view."""
-        r_w_g = self.mount.r_w_c(self.path.state(t_s)) @ LOOKING_ALONG_X
-        q, flags = quat_from_euler(*euler_from_rot(r_w_g)), YAW_LOCK | IN_EARTH
-        return mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, round(1e3 * t_s), flags, q, *(0.0,) * 3, 0)
+        times_s, mount = np.arange(0.0, self.duration_s, GIMBAL_S), self.mount
+        held = ((t_s, mount.r_w_c(self.path.state(t_s)) @ LOOKING_ALONG_X) for t_s in times_s.tolist())
+        return [(t_s, quat_from_euler(*euler_from_rot(r_w_g))) for t_s, r_w_g in held]
 
 
 def plan_flight(place: World, camera_image_bgr: np.ndarray, duration_s: float, frame_hz: float = FRAME_HZ) -> Flight:
@@ -217,7 +212,7 @@ def write_flight(
 
 def add_telemetry(folder: Path, flight: Flight) -> None:
     """Writes telemetry.tlog into the folder. Raises OutputError."""
-    flight.telemetry.write(folder / "telemetry.tlog", flight.gimbal_records())
+    flight.telemetry.write(folder / "telemetry.tlog", flight.gimbal_attitudes())
 
 
 def truth_row(frame: LocalFrame, state: State) -> list[str]:

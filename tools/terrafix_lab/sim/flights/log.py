@@ -6,7 +6,9 @@ from pathlib import Path
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import OutputError
+from terrafix.core.mavlink.gimbal import IN_EARTH, YAW_LOCK
 from terrafix.core.mavlink.tlog import record
+from terrafix.messages import Quat
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.interfaces import Readings
 
@@ -45,9 +47,13 @@ class TelemetryLog:
         if packets:
             self._records.append((self._t0_us + round(readings.t_s * 1e6), packets))
 
-    def write(self, path: Path, others: Sequence[tuple[float, bytes]] = ()) -> None:
-        """Writes the file. ``others``: seconds and packets of other devices. Raises OutputError."""
-        records = [*self._records, *((self._t0_us + round(t_s * 1e6), packets) for t_s, packets in others)]
+    def write(self, path: Path, gimbal: Sequence[tuple[float, Quat]] = ()) -> None:
+        """Writes the file. ``gimbal``: seconds, and attitude of the camera in north, east, down. Raises OutputError."""
+        sender, flags, still = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), YAW_LOCK | IN_EARTH, (0.0,) * 3
+        records = list(self._records)
+        for t_s, q in gimbal:
+            status = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, round(1e3 * t_s), flags, q, *still, 0)
+            records.append((self._t0_us + round(t_s * 1e6), bytes(status.pack(sender))))
         try:
             path.write_bytes(b"".join(record(*one) for one in sorted(records)))
         except OSError as error:
