@@ -155,7 +155,6 @@ class SourceFacts(Message, frozen=True, kw_only=True):
     """What the source says of itself when it is opened: where each number comes from, what is assumed, and what is left
     out and why. Published after Origin."""
 
-    name: str
     facts: tuple[Fact, ...]
 
 

@@ -66,6 +66,7 @@ def replay(
     configs: list[Path] | None = None,
     progress: bool = False,
     start: tuple[float, float] | None = None,
+    topics: Mapping[str, str] | None = None,
     nodes: MakeNodes = make_nodes,
     wrap_source: MakeSource = lambda source: source,
     watch: Watch = lambda messages: None,
@@ -73,6 +74,7 @@ def replay(
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
     ``flight``: a source, or its name. ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg), overrides the source's.
+    ``topics``: of a bag, by kind.
     ``nodes`` and ``wrap_source`` wrap the nodes and the source (to measure time, to inject faults). ``watch`` gets the
     messages of the origin, of each frame and of the end, when they are on disk. Raises subclasses of TerrafixError.
     """
@@ -83,7 +85,7 @@ def replay(
         if is_live(name) and not Path(flight).exists():
             shown = without_password(name)
             raise UsageError(f"{shown}: a live camera cannot be replayed; fly it with 'terrafix run --source {shown}'")
-        flight = open_configured(config.source, str(flight), start)
+        flight = open_configured(config.source, str(flight), start, topics)
     opened, source = flight, wrap_source(flight)
     package = package_of(_map_of(map_path, config, source), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
@@ -100,7 +102,7 @@ def replay(
         ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
         published: list[Message] = []
         shell = InProcessShell(nodes(ctx), lambda _who, message: published.append(message))
-        said = SourceFacts(t_ns=origin.t_ns, name=source.name(), facts=tuple(facts))
+        said = SourceFacts(t_ns=origin.t_ns, facts=tuple(facts))
         _feed_flight(source, origin, said, shell, frames, published, output, watch, progress)
         counts = output.counts()
         if UNMEASURED in counts["verdict"]["cause"] and not isinstance(opened, RecordedFrames):

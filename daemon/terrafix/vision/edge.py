@@ -76,7 +76,7 @@ class SourceEdge:
                 self._source.origin() if self._bounds is None else with_map_center(self._source.origin(), self._bounds)
             )
             ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
-            said = SourceFacts(t_ns=self._zero_ns, name=self._source.name(), facts=tuple(facts_of(self._source)))
+            said = SourceFacts(t_ns=self._zero_ns, facts=tuple(facts_of(self._source)))
             flight_id = live_flight_id(self._zero_ns)
             origin = msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m, flight_id=flight_id)
             return [origin, said]

@@ -91,7 +91,7 @@ def test_recorded_messages_are_read_back(tmp_path: Path) -> None:
 
 
 def test_every_segment_and_the_report_have_what_the_source_says(tmp_path: Path) -> None:
-    said = m.SourceFacts(t_ns=5, name="cam", facts=(m.Fact("clock", "by arrival"), m.Fact("height", "not stated")))
+    said = m.SourceFacts(t_ns=5, facts=(m.Fact("clock", "by arrival"), m.Fact("height", "not stated")))
     ring = SegmentRing(tmp_path, header(Config()), budget_mb=100)
     for message in (origin(), said):
         ring.write(message, 5)

@@ -72,8 +72,8 @@ def test_a_3d_fix_has_its_accuracy_position_and_source() -> None:
 
 
 def test_what_the_source_says_of_itself_is_a_fact() -> None:
-    said = SourceFacts(t_ns=0, name="cam", facts=(Fact("clock", "by arrival"),))
-    assert after(1.0, (0.5, said))["source"] == {"name": "cam", "facts": [{"topic": "clock", "text": "by arrival"}]}
+    said = SourceFacts(t_ns=0, facts=(Fact("clock", "by arrival"),))
+    assert after(1.0, (0.5, said))["source"] == [{"topic": "clock", "text": "by arrival"}]
     assert after(1.0)["source"] is None
 
 

@@ -30,7 +30,7 @@ def facts(status: Status, processes: list[ProcessState], now_ns: int) -> dict[st
     """-> source, position, autopilot, processes, rates, computer and log; None: not known (yet)."""
     source = status.last(SourceFacts)
     return {
-        "source": None if source is None else {"name": source.name, "facts": [f._asdict() for f in source.facts]},
+        "source": None if source is None else [fact._asdict() for fact in source.facts],
         "position": _position(status, now_ns),
         "autopilot": _autopilot(status, now_ns),
         "processes": [_process(status, process) for process in processes],

@@ -11,6 +11,7 @@ from terrafix.messages import Camera, Fact, Origin, VehicleState
 if TYPE_CHECKING:
     from terrafix.core.autopilot_log.own_log import OwnLog
     from terrafix.core.mavlink.tlog import TelemetryLog
+    from terrafix.vision.sources.rosbag import BagTelemetry
 
 GAP_TIMES = 3.0  # a gap is longer than this many times the median interval
 
@@ -81,7 +82,7 @@ def telemetry_facts(states: Sequence[VehicleState], whence: str, origin: Origin)
             yield Fact(topic, f"{count} values from {whence}{sigma}" if count else "not stated")
 
 
-def log_facts(log: "TelemetryLog | OwnLog") -> Iterator[Fact]:
+def log_facts(log: "TelemetryLog | OwnLog | BagTelemetry") -> Iterator[Fact]:
     """Clock, vehicles and damage of a log."""
     yield Fact("clock", f"{log.path.name}: {log.clock}; zero is {log.zero}")
     if len(log.vehicles) == 1:
