@@ -29,7 +29,6 @@ EXTRAS = {
         "fastapi", "starlette", "uvicorn", "sqlalchemy", "python_multipart", "pydantic",
         "terrafix_tools.console",
     ),
-    "rosbag": ("rosbags",),
     "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "yaml", "terrafix_"),
     "rosbag": ("rosbags",),
 }  # fmt: skip

@@ -8,7 +8,7 @@ from collections import Counter
 from terrafix.messages import CalibrationFault, Verdict
 
 FROZEN, OTHER, EMPTY = "picture frozen", "picture contradicts motion", "picture without texture"
-KINDS = {
+INPUT_KINDS = {
     Verdict.STALLED: FROZEN,
     Verdict.IMPLAUSIBLE: OTHER,  # it agrees with itself, and not with this flight
     Verdict.UNCONFIRMED: OTHER,
@@ -40,10 +40,10 @@ class RefusedPictures:
                 return []
             ended, self._active = self._active, ""
             return [CalibrationFault(t_ns=t_ns, quantity=ended, factor=None, detail="pictures are used", active=False)]
-        if verdict not in KINDS:  # nothing is known of the picture
+        if verdict not in INPUT_KINDS:  # nothing is known of the picture
             return []
         self._used = 0
-        self._refused.append((t_ns, KINDS[verdict]))
+        self._refused.append((t_ns, INPUT_KINDS[verdict]))
         first_ns = self._refused[0][0]
         if self._active or len(self._refused) < REFUSED_FRAMES or t_ns - first_ns < AFTER_NS:
             return []
