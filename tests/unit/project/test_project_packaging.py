@@ -198,7 +198,6 @@ def test_without_the_ground_extra_one_line_states_what_to_install(command: str) 
     code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    pip = f"{sys.executable} -m pip install"
     assert done.stderr == f"terrafix: this command needs rasterio; install it: {install_command('ground')}\n"
 
 
