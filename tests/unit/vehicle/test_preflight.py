@@ -322,7 +322,7 @@ class Streaming(GroundAutopilot):
             for _ in range(int(each * self.now_s) - int(each * before_s)):
                 kind = mavlink.mavlink_map[message_id]
                 lengths = (kind.array_lengths[place] for place in kind.orders)
-                self._send(kind(*([0] * n if n else 0 for n in lengths)))
+                self.send(kind(*([0] * n if n else 0 for n in lengths)))
         return super().read()
 
 
