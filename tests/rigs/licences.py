@@ -36,6 +36,7 @@ NAMED = {
     "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
     "Python Software Foundation License": "PSF-2.0",
     "The Unlicense (Unlicense)": "Unlicense",
+    "any-OSI": "Zlib",  # of apsw: any licence of the Open Source Initiative, this one was its first
 }
 # Extras that the check does not install, because they need a compiler or a GPU, or are for one
 # export: read on their pages.

@@ -198,7 +198,7 @@ def run(
 
 @app.command()
 def replay(
-    flight: Annotated[Path, typer.Argument(help="Flight folder, photo folder, video, or flight record.")],
+    flight: Annotated[Path, typer.Argument(help="Flight folder, photo folder, video, ROS bag, or flight record.")],
     map_path: Annotated[
         Path | None, typer.Option("--map", help="Map package or GeoTIFF; default: the flight's.")
     ] = None,
@@ -208,6 +208,7 @@ def replay(
     model: Annotated[list[str] | None, typer.Option(help="Name of a fetched model (xfeat), or NAME=PATH.")] = None,
     start: StartOption = "",
     config: ConfigOption = None,
+    topic: Annotated[list[str] | None, typer.Option(help="KIND=TOPIC of a ROS bag: docs/flight-folder.md.")] = None,
     frames: Annotated[
         bool, typer.Option("--frames", help="Of a record with frames: compute vision and map matching again, too.")
     ] = False,
@@ -218,12 +219,13 @@ def replay(
     A flight record (.mcap, or the folder of a run) is replayed from its messages: the estimator computes again. With
     --frames all of it is computed again from its frames, also with another map, model or configuration."""
     from terrafix.recorder.reader import is_record
-    from terrafix.vision.sources import parse_start
+    from terrafix.vision.sources import parse_start, parse_topics
+    from terrafix.vision.sources.bag_topics import is_bag
     from terrafix_tools.replay import replay as run_replay
     from terrafix_tools.rerun.frames import RecordedFrames
 
     source: Path | RecordedFrames = flight
-    if is_record(flight):
+    if is_record(flight) and not is_bag(flight):
         if not frames:
             _replay_from_messages(flight, out, other_inputs=bool(map_path or model or start or config), quiet=quiet)
             return
@@ -240,6 +242,7 @@ def replay(
         configs=config or [],
         progress=not quiet,
         start=parse_start(start),
+        topics=parse_topics(topic or []),
     )
     if summary["verdict"]["active_faults"]:
         raise typer.Exit(1)

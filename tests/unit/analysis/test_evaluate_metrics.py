@@ -164,7 +164,7 @@ def test_the_columns_of_estimates_csv_are_as_specified() -> None:
     assert ",".join(COLUMNS) == (
         "file,t_s,lat_deg,lon_deg,alt_amsl_m,agl_m,sigma_e_m,sigma_n_m,cov_en_m2,yaw_deg,source_label,anchor_age_ms,"
         "covariance_mode,process_ms,refined_lat_deg,refined_lon_deg,refined_alt_amsl_m,refined_q_w_c,refined_cov,"
-        "refined_m_per_unit,refined_fragment_id"
+        "refined_m_per_unit,refined_fragment_id,frame_uid"
     )
 
 

@@ -26,7 +26,15 @@ EXTRAS = {  # libraries, without our own distribution for the ground
     extra: {canonicalize_name(Requirement(r).name): Requirement(r) for r in requirements if GROUND["name"] not in r}
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
-WITHOUT_GROUND = {"vehicle", "gstreamer", "faiss", "dev", "docs", "nightly"}  # what a vehicle may have, and the checks
+WITHOUT_GROUND = {
+    "vehicle",
+    "gstreamer",
+    "faiss",
+    "rosbag",
+    "dev",
+    "docs",
+    "nightly",
+}  # what a vehicle may have, and the checks
 IMPORTED_AS = {
     "foxglove-schemas-protobuf": "foxglove_schemas_protobuf",
     "protobuf": "google",
@@ -46,6 +54,7 @@ EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 SEARCH = ROOT / "daemon" / "terrafix" / "anchor" / "place_index" / "faiss_ivf.py"  # the only file that imports FAISS
 SERVICE = ROOT / "daemon" / "terrafix" / "runtime" / "systemd.py"  # the only file that imports systemd-python
 ULOG = ROOT / "daemon" / "terrafix" / "core" / "autopilot_log" / "ulog.py"  # the only file that imports pyulog
+BAGS = ROOT / "daemon" / "terrafix" / "vision" / "sources" / "bag_reader.py"  # the only file that imports rosbags
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools", "terrafix_lab"}
 SOURCES = ("daemon", "engines", "tools")
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
@@ -53,12 +62,12 @@ LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 def imported(*folders: str, extras: bool = True) -> set[str]:
     """Top-level names of all third-party modules imported below the folders; with or without the code of the extras of
-    what flies: FAISS, systemd and pyulog."""
+    what flies: FAISS, systemd, pyulog and rosbags."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
         for path in (ROOT / folder).rglob("*.py"):
-            if not extras and path in (SEARCH, SERVICE, ULOG):
+            if not extras and path in (SEARCH, SERVICE, ULOG, BAGS):
                 continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Import):
@@ -272,10 +281,8 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
 def test_a_command_that_a_vehicle_does_not_have_says_what_to_install(unpacked: Path, words: str, extra: str) -> None:
     done = in_wheel(unpacked, *words.split())
     assert done.returncode == 2
-    what = (
-        f"{sys.executable} -m pip install 'terrafix[{extra}]'"  # of an unpacked wheel nobody knows where it came from
-    )
-    assert done.stderr == f"terrafix: this command needs terrafix-ground; install it: {what}\n"
+    pip = f"{sys.executable} -m pip install"
+    assert done.stderr == f"terrafix: this command needs terrafix-ground; install it: {pip} 'terrafix[{extra}]'\n"
 
 
 def test_a_geotiff_on_a_vehicle_is_one_line(unpacked: Path, tmp_path: Path) -> None:

@@ -153,7 +153,7 @@ def test_practice_needs_no_link(tmp_path: Path) -> None:
         ),
         (
             "file:///d/terrafix-1.whl",
-            "/opt/pipx/venvs/terrafix",
+            "/opt/a/.local/share/pipx/venvs/terrafix",
             "pipx install --force '/d/terrafix-1.whl[ground]' --pip-args '--find-links /d'",
         ),
         ("", "/venv", "/venv/bin/python -m pip install 'terrafix[ground]'"),

@@ -4,7 +4,7 @@ Messages of sensor_msgs and geometry_msgs (REP 103: east, north, up; REP 105: fr
 level, where NavSatFix states ellipsoidal ones: the geoid is not subtracted."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from terrafix_tools.export.track import Track, TrackPose
 
 FIX_TOPIC, POSE_TOPIC = "/terrafix/fix", "/terrafix/pose"
 MAP_FRAME, CAMERA_FRAME = "map", "camera_optical_frame"
-VERSION = 9  # of bags since ROS 2 Iron; Humble reads it, too
+VERSION: Final = 9  # of bags since ROS 2 Iron; Humble reads it, too
 STATUS_FIX, SERVICE_UNKNOWN, KNOWN = 0, 0, 3  # sensor_msgs/NavSatStatus, NavSatFix
 
 

@@ -99,6 +99,7 @@ def events(view: FlightView) -> list[tuple[float | None, str]]:
     lens = lens_words(view.origin.camera, view.calibration) if view.origin and view.calibration else None
     if lens is not None:
         entries.append((None, lens))
+    entries += [(None, f"Camera: {words}.") for words in view.camera_times.words()]
     for t_s, event in view.events:
         if event.event in UNPLANNED or event.event == "restarted":
             detail = f" ({event.detail})" if event.detail else ""
