@@ -3,6 +3,7 @@ by pymavlink, and mode names are those of its own table."""
 
 import math
 from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from terrafix.core.errors import SourceError
 from terrafix.core.mavlink.tlog import TelemetryLog, read_imu, read_tlog
 from terrafix.core.mavlink.vehicles import ARDUPILOT_TYPES
 from terrafix.vision.sources import open_source
+from terrafix_lab.sim.autopilot.peer import telemetry_records
 from terrafix_tools import cli
 from terrafix_tools.autopilot_log.read import read_autopilot_log
 
@@ -301,3 +303,18 @@ def test_logs_of_the_field_are_read_as_they_were_flown(
     assert read.span_s[1] - read.span_s[0] == pytest.approx(59.9, abs=1e-3)
     assert f"{read.firmware} {next(e.text for e in read.events if e.kind == 'mode')}" == mode
     assert np.all(np.diff(read.attitude.t_s) > 0.0)
+
+
+def test_a_simulated_autopilot_leaves_the_log_that_a_ground_station_would(tmp_path: Path) -> None:
+    records = log(tmp_path / "right.tlog")
+    signer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    signer.signing.sign_outgoing, signer.signing.secret_key, signer.signing.timestamp = True, bytes(32), 1
+    signed = signer.heartbeat_encode(2, 3, 209, 5, 4, 3).pack(signer)
+    last_us = int.from_bytes(records[-1][:8], "big")
+    written = [(stamp, b"".join(r[8:] for r in group)) for stamp, group in groupby(records, lambda r: r[:8])]
+    data = b"".join(telemetry_records(packets, int.from_bytes(stamp, "big")) for stamp, packets in written)
+    assert data == b"".join(records)
+    both = telemetry_records(signed + records[0][8:], last_us)
+    assert both == last_us.to_bytes(8, "big") + signed + last_us.to_bytes(8, "big") + records[0][8:]
+    (tmp_path / "left.tlog").write_bytes(data)
+    assert len(read_autopilot_log(tmp_path / "left.tlog").attitude.t_s) == SECONDS * RATE_HZ

@@ -123,7 +123,7 @@ def test_what_is_wrong_in_a_statement_is_said_in_one_line(fleet: Path, sql: str)
 
 def test_without_duckdb_one_line_states_what_to_install(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "duckdb", None)
-    with pytest.raises(UsageError, match=r"need duckdb; install it: pip install 'terrafix\[fleet\]'$"):
+    with pytest.raises(UsageError, match=r"need duckdb; install it: .*\[fleet\]'"):
         query(fleet, "SELECT 1")
 
 

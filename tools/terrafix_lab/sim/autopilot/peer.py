@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 from terrafix.core.errors import LinkError
 from terrafix.core.geodesy import LocalFrame
@@ -28,6 +29,19 @@ from terrafix_lab.sim.sensors.suite import VehicleSensors
 
 STEP_S = 0.02
 DATAGRAM_MAX = 4096
+FRAME_BYTES, SIGNATURE_BYTES = 12, 13  # of a MAVLink 2 packet: header with checksum, signature
+
+
+def telemetry_records(packets: bytes, unix_us: int) -> bytes:
+    """MAVLink 2 packets, one after the other, as records of a telemetry log: microseconds since 1970 (8 bytes, big
+    endian), packet. [spec: https://mavlink.io/en/guide/serialization.html]"""
+    records, at = [], 0
+    while at < len(packets):
+        signature = SIGNATURE_BYTES if packets[at + 2] & 1 else 0
+        end = at + FRAME_BYTES + packets[at + 1] + signature
+        records.append(unix_us.to_bytes(8, "big") + packets[at:end])
+        at = end
+    return b"".join(records)
 
 
 class AutopilotPeer:
@@ -44,8 +58,11 @@ class AutopilotPeer:
         kind: Kind = Kind.PLANE,
         parameters: dict[str, float] | None = None,
         home_amsl_m: float | None = None,
+        log: Path | None = None,
     ) -> None:
-        """Raises UsageError for an unknown parameter."""
+        """``log``: telemetry log (.tlog) of what it sends, as a ground station keeps it. Raises UsageError for an
+        unknown parameter."""
+        self._log = log
         self._parameters = GPS_INPUT_ALONE | NO_DCM | (parameters or {})
         self._seed, self._aligned, self._sysid, self._home_amsl_m = seed, aligned, sysid, home_amsl_m
         self._kind = kind
@@ -73,6 +90,7 @@ class AutopilotPeer:
             self._socket.close()
             raise LinkError(f"autopilot peer: port {port} cannot be used ({error.strerror}); choose another") from None
         self._socket.setblocking(False)
+        self._log_stream = None if self._log is None else self._log.open("wb")
         self._companion = None if to is None else ("127.0.0.1", to)
         self._started_s = time.monotonic()
         self._clock = clock or self._now_s
@@ -90,6 +108,8 @@ class AutopilotPeer:
             self._thread.join()
             self._socket.close()
             self._thread = None
+            if self._log_stream is not None:
+                self._log_stream.close()
         if not self._landed:
             raise RuntimeError("the autopilot peer's thread has died; its traceback is above")
         return self._monitor.report()
@@ -209,6 +229,8 @@ class AutopilotPeer:
     def _send_packets(self, packets: bytes) -> None:
         if self._companion is None or self.muted:
             return
+        if self._log_stream is not None:
+            self._log_stream.write(telemetry_records(packets, time.time_ns() // 1000))
         try:
             self._socket.sendto(packets, self._companion)
         except OSError:  # no receiver, or no buffer space: a radio would lose the packet as well

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from terrafix.core.errors import EvaluationError, SourceError, UsageError
 from terrafix_lab.sim.autopilot.verdict import gps_input_failure, key_figures
 from terrafix_lab.sim.demo.console import URL, DemoConsole, console_beside
-from terrafix_lab.sim.demo.flight import fly
+from terrafix_lab.sim.demo.flight import LOG, fly
 from terrafix_lab.sim.flights.folder import FRAME_HZ, Flight, add_telemetry, plan_flight, write_flight
 from terrafix_lab.sim.out_folder import prepare_folder, write_json
 from terrafix_lab.sim.world import place as world
@@ -94,6 +94,7 @@ def _fly_and_report(out: Path, seed: int, duration_s: float, console: Console, b
     for line in key_figures(evaluation, peer):
         console.print(line, highlight=False, soft_wrap=True)
     console.print(f"report   {page}", highlight=False, soft_wrap=True)
+    console.print(f"next     terrafix log autopilot {out} {out / LOG}", highlight=False, soft_wrap=True)
     if problem:
         typer.echo(f"terrafix demo: GPS_INPUT was not used: {problem}; see {out / 'terrafix.log'}", err=True)
         return EXIT_FAILED

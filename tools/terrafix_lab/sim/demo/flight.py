@@ -15,6 +15,7 @@ from terrafix_lab.sim.autopilot.peer import AutopilotPeer
 from terrafix_lab.sim.autopilot.report import PeerReport
 from terrafix_lab.sim.flights.folder import Flight
 
+LOG = "autopilot.tlog"  # what the autopilot sent, for `terrafix log autopilot`
 POLL_S = 1.0  # polling interval of the autopilot's status
 LOG_INTERVAL_S = 15.0  # interval of status lines on a non-interactive console
 
@@ -66,7 +67,7 @@ def fly(
 
     ``on_start`` is called when the first process has started, and again with each further one."""
     clock = FlightClock()
-    peer = AutopilotPeer(seed=seed, home_amsl_m=flight.ground_amsl_m)
+    peer = AutopilotPeer(seed=seed, home_amsl_m=flight.ground_amsl_m, log=out / LOG)
     landed = threading.Event()
     reports: list[PeerReport] = []
 
