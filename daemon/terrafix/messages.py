@@ -12,6 +12,7 @@ Conventions
 """
 
 from enum import StrEnum
+from typing import NamedTuple
 
 import msgspec
 from msgspec import UNSET, UnsetType
@@ -141,6 +142,20 @@ class Origin(Message, frozen=True, kw_only=True):
     yaw_sigma_deg: float
     agl_sigma_m: float
     attitude_sigma_deg: float  # of reported roll and pitch
+    flight_id: str = ""  # UUID; with the number of a frame it names that frame over all flights (core/flight_id.py)
+
+
+class Fact(NamedTuple):
+    # "camera", "mount", "start", "height", "heading", "tilt", "clock", "exposure", "rate", "vehicles", "left out"
+    topic: str
+    text: str
+
+
+class SourceFacts(Message, frozen=True, kw_only=True):
+    """What the source says of itself when it is opened: where each number comes from, what is assumed, and what is left
+    out and why. Published after Origin."""
+
+    facts: tuple[Fact, ...]
 
 
 OVERTAKEN = "overtaken: a newer frame was there first"  # error of a frame that was left out, not of the camera
@@ -528,6 +543,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     emitted_at_ns: int  # time of publication; in a replay, the time of the frame
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
     joined: bool = True  # ... is joined to the flight (as in Prediction)
+    frame_uid: str = ""  # UUID of the flight and number of the frame; empty: the flight has no id
 
     @property
     def is_placed(self) -> bool:
@@ -682,6 +698,9 @@ class Refinement(Message, frozen=True, kw_only=True):
     source: RefinementSource = RefinementSource.FLIGHT
 
 
+NO_FRAME_ID = -1  # frame_id of a verdict that belongs to no frame
+
+
 class MeasurementVerdict(Message, frozen=True, kw_only=True):
     """Result of the checks of one measurement. Every rejection has one (law 3); of heights and headings only those."""
 
@@ -704,6 +723,9 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
 
 
 # --- link -----------------------------------------------------------------------------------------
+
+
+NO_FIX, FIX_2D, FIX_3D = 1, 2, 3  # GPS_FIX_TYPE of MAVLink's common.xml
 
 
 class GpsInput(Message, frozen=True, kw_only=True):
@@ -846,6 +868,8 @@ class EkfStatus(Message, frozen=True, kw_only=True):
     flags: int  # EKF_STATUS_FLAGS
     position_ratio: float  # horizontal innovation over its gate (test ratio): 1 is the limit
     velocity_ratio: float
+    lat_deg: float | None = None  # its own horizontal position, not more than a second old; None: it reports none
+    lon_deg: float | None = None
 
 
 class WallClock(Message, frozen=True, kw_only=True):
@@ -956,6 +980,7 @@ class LogLine(Message, frozen=True, kw_only=True):
 
 AnyMessage = (
     Origin
+    | SourceFacts
     | Frame
     | VehicleState
     | Imu

@@ -30,6 +30,7 @@ OPERATOR = "operator"  # a command on this computer that publishes PositionHint;
 
 ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.Origin,
+    m.SourceFacts,
     m.Frame,
     m.VehicleState,
     m.Imu,
@@ -183,6 +184,7 @@ PROCESSES: tuple[Process, ...] = (
         (m.Origin, m.Frame, m.Health, m.Exposure),
         (
             m.Origin,
+            m.SourceFacts,
             m.Frame,
             m.VehicleState,
             m.Imu,

@@ -21,6 +21,7 @@ from terrafix.anchor.frame_pose import (
 )
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, View, view_at
+from terrafix.anchor.matching.layer_selector import POOR_SCORE
 from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
 from terrafix.anchor.matching.match_message import pose_match
 from terrafix.anchor.matching.point_mass_filter import MAX_HALF_CELLS, Belief, Mode, belief_cell_m
@@ -80,8 +81,6 @@ START_SIGMA_FLOOR_M = 8.0
 # taken, and a change of the tilt error by one degree between frames moves it. A tilt that is known better contributes
 # less. It is added per frame, and a slow copter at two frames a second observes little new ground to remove it. [tuned]
 TILT_JITTER = 0.02
-# Standardised correlation at the mode that counts as poor; a frame at the right place has 3 to 10. [tuned]
-POOR_SCORE = 2.0
 MAX_POOR_WEIGHT = 4.0  # consecutive full observations below it before the window is widened [tuned]
 WIDEN_FACTOR = 1.6  # of the window's half width [tuned]
 CELL_RATIO_MIN, CELL_RATIO_MAX = 0.4, 2.5  # hysteresis of a belief cell's octave [tuned]

@@ -10,7 +10,7 @@ import numpy as np
 
 # Messages of MAVLink, the preferred one first: by the camera's signal, by the camera, by the signal that triggers it.
 EXPOSURE_KINDS = ("CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED", "CAMERA_TRIGGER")  # [spec: MAVLink common.xml]
-MIN_FRAMES = 5  # with an exposure of their own [spec: four intervals, which chance does not repeat]
+MIN_EXPOSED_FRAMES = 5  # with an exposure of their own [spec: four intervals, which chance does not repeat]
 LOST = 0.02  # probability that an image or a report is lost [tuned]
 REACH = 0.25  # share of the shortest interval of exposures within which a stamp has one [spec: half of a half]
 MIN_JITTER_S = 1e-3  # to which logs and reports state times [spec: time_boot_ms]
@@ -48,7 +48,7 @@ def match_exposures(stamps_s: np.ndarray, exposures_s: np.ndarray, sigma_s: floa
 
     ``sigma_s``: 1-sigma of the latency about 0. ``complete``: every frame and exposure of the flight is there, so that
     exposures beyond the frames count as lost images."""
-    if len(stamps_s) < MIN_FRAMES or len(exposures_s) < MIN_FRAMES:
+    if len(stamps_s) < MIN_EXPOSED_FRAMES or len(exposures_s) < MIN_EXPOSED_FRAMES:
         return f"{len(exposures_s)} exposures and {len(stamps_s)} frames are too few to compare"
     interval_s = float(np.quantile(np.diff(exposures_s), 0.1))
     tried = [
@@ -57,7 +57,7 @@ def match_exposures(stamps_s: np.ndarray, exposures_s: np.ndarray, sigma_s: floa
     ]
     ranked = sorted((one for one in tried if one is not None), key=lambda one: -one.log_likelihood)
     chance = len(stamps_s) * np.log(LOST / interval_s)  # every stamp without an exposure
-    if not ranked or ranked[0].seen.sum() < MIN_FRAMES or ranked[0].log_likelihood + MAX_AGAINST < chance:
+    if not ranked or ranked[0].seen.sum() < MIN_EXPOSED_FRAMES or ranked[0].log_likelihood + MAX_AGAINST < chance:
         return f"no latency up to {3.0 * sigma_s:.3g} s fits {len(exposures_s)} exposures to {len(stamps_s)} frames"
     best = ranked[0]
     for other in ranked[1:]:

@@ -10,22 +10,25 @@ from msgspec import UNSET
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
+from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.claim import Claim
 from terrafix.estimator.edge import EstimatorEdge
 from terrafix.estimator.estimator import Estimator
-from terrafix.estimator.filter_state import FrameInput, FrameState
+from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState
 from terrafix.estimator.initialization import ResetReason
 from terrafix.estimator.integrity.camera_vehicle import CameraVehicleTest
-from terrafix.estimator.integrity.innovation import FusionVerdict
-from terrafix.estimator.integrity.time_offset import TimeOffset
+from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
+from terrafix.estimator.integrity.offset_drift import STEP_S
+from terrafix.estimator.integrity.time_offset import Contradiction, TimeOffset
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
 from terrafix.estimator.measurements.odometry import NO_NEW_VIEW, without_ground
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
+from terrafix.estimator.monitors.refused_pictures import RefusedPictures
 from terrafix.estimator.output import (
     calibration_of,
     estimate_of,
@@ -123,6 +126,7 @@ class EstimatorNode:
         self._relocated = False  # a relocalisation has moved the estimate since
         self._monitors: Monitors | None = None
         self._rebuilds = 0  # of the graph
+        self._refused = RefusedPictures()
         self._start_moved = False  # as reported
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
             Origin: self._on_origin,
@@ -319,6 +323,10 @@ class EstimatorNode:
         if (camera_vehicle := self._camera_vehicle.on_odometry(odometry, self._estimator.origin.camera)) is not None:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
+        newest = self._estimator.last
+        if newest is not None and odometry.t_ns * 1e-9 < newest.t_s + STEP_S:  # by an offset that has jumped
+            yield odometry_verdict(odometry, Verdict.STALE, "taken before the newest frame")
+            return
         estimator, frame = self._frame_input(self._estimator, odometry)
         odometry = frame.odometry
         follows = not self._relocated and self._note_predicted_frame(estimator)
@@ -343,12 +351,18 @@ class EstimatorNode:
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
             # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground anyhow.
-            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground
+            # Near the ground images move by more than their error, and on it the attitude wanders alone.
+            low = frame.attitude.stands or agl_m < MIN_MATCHING_AGL_M
+            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground or low
+            jump = estimator.state.image_jump
             if estimator.state.orientation.suspects or untimed:
                 time_offset.forget_images()
             else:
+                if jump is not None and jump[0] == frame.t_s:
+                    self._time_contradicted(stamped_ns, jump[1], result.placed, by_map=False)
                 time_offset.add(msgspec.structs.replace(odometry, t_ns=stamped_ns), self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
+        yield from self._refused_pictures(odometry.t_ns, result.verdict, estimator.state, frame.attitude)
         yield from self._start_fault(estimator, odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:
@@ -358,6 +372,25 @@ class EstimatorNode:
             self._ahrs.position_published(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
         yield from odometry_link(estimator, result, odometry.t_ns)  # last: it delays nothing
+
+    def _time_contradicted(self, t_ns: int, off: Innovation, frame: FrameState, *, by_map: bool) -> None:
+        """``off``: a frame at the uncorrected ``t_ns`` the estimate; ``frame``: the newest one."""
+        assert self._flight is not None
+        agl_m = max(self._flight.estimator.terrain.height_above_m(frame.pose.translation()), 1.0)
+        seen = Contradiction(t_ns, off, frame.velocity_mps[:2], agl_m)
+        self._flight.time_offset.contradict(seen, self._telemetry, by_map=by_map)
+
+    def _refused_pictures(
+        self, t_ns: int, verdict: Verdict, state: FilterState, attitude: Attitude
+    ) -> Iterable[Message]:
+        """Faults of pictures that are refused for no reason that has a name already."""
+        assert self._flight is not None
+        if attitude.stands:  # a camera on the ground is out of focus
+            return ()
+        if verdict is Verdict.UNCONFIRMED and not state.continuity.last_increment_inertial:
+            return ()  # nothing says how the vehicle moves
+        named = state.orientation.fault is not None or self._flight.time_offset.is_wrong
+        return self._refused.add(t_ns, Verdict.ACCEPTED if named else verdict)
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved
@@ -487,6 +520,12 @@ class EstimatorNode:
         yield from (verdict_of(match.t_ns, match.frame_id, verdict, fragment) for verdict in verdicts)
         yield outcome.solution
         accepted = result.verdict is Verdict.ACCEPTED
+        if accepted:
+            flight.time_offset.agree()
+        elif result.off is not None and estimator.last is not None:
+            stamp_ns = match.t_ns + round(flight.time_offset.applied_s * 1e9)
+            self._time_contradicted(stamp_ns, result.off, estimator.last, by_map=True)
+            yield from flight.time_offset.take_changes(match.t_ns)
         if self._monitors is not None:
             yield from self._monitors.take_changes(match.t_ns)
         changed = accepted or was_multimodal or estimator.hypotheses.is_multimodal or result.verdict is Verdict.LOST

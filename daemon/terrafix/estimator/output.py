@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from terrafix.core.flight_id import frame_uid
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
 from terrafix.core.map_error import shared_variance_m2
 from terrafix.core.pose import tangent_to_world
@@ -127,6 +128,7 @@ def estimate_of(
         covariance_mode=state.mode,
         last_anchor_age_ms=age_ms,
         emitted_at_ns=max(t_ns, round(frame.t_s * 1e9)),  # the live executor sets the time of publishing here
+        frame_uid=frame_uid(state.origin.flight_id, frame.frame_id),
         **_named(fragment),
     )
 

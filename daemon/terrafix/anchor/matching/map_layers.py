@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, Describer
+from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, Describer
 from terrafix.anchor.matching.descriptor_store import MAX_TILES, DescriptorStore
 from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher, View
 from terrafix.anchor.matching.layer_selector import LayerSelector
@@ -63,7 +63,7 @@ class MapLayers:
                 store = DescriptorStore(
                     store_folder, f"{_file_identity(package)} {frame} {layer.table}", MAX_TILES // len(layers)
                 )
-            cache_bytes = CACHE_BYTES // len(layers)
+            cache_bytes = DESCRIPTOR_CACHE_BYTES // len(layers)
             matcher = FrameMatcher(camera, bound, describer, cache_bytes, store, layer.is_drawn, correlator)
             sigma_m = accuracy_of(layer, ce90_m).sigma_m
             recognizer = None

@@ -4,7 +4,7 @@ inertial readings and gimbal. Its GNSS positions are not read.
 Times are those of the autopilot's clock, less the time of the flight's zero on it."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -140,26 +140,30 @@ class OwnLog:
         return sorted(found, key=lambda one: one.t_ns)
 
     def _imu(self, read: _Read) -> list[Imu]:
-        t_s, values = read.forces
-        keep = np.isfinite(values).all(axis=1) & np.isfinite(t_s)
-        keep[1:] &= np.diff(t_s) > 0
-        t_s, values = t_s[keep], values[keep]
-        if len(t_s) < 2:
-            return []
-        mean_of = max(1, round(1.0 / (MAX_IMU_HZ * float(np.median(np.diff(t_s))))))
-        groups = len(t_s) // mean_of
-        times = t_s[: groups * mean_of].reshape(groups, mean_of).mean(axis=1)
-        means = values[: groups * mean_of].reshape(groups, mean_of, 6).mean(axis=1)
-        return list(self._batches(times, means))
+        return imu_batches(*read.forces, self._ns, "log")
 
-    def _batches(self, times: np.ndarray, means: np.ndarray) -> Iterator[Imu]:
-        for first in range(0, len(times), IMU_BATCH):
-            ns = [self._ns(float(t)) for t in times[first : first + IMU_BATCH]]
-            samples: list[ImuSample] = [
-                (ns[-1] - t_ns, *map(float, row))  # type: ignore[misc]
-                for t_ns, row in zip(ns, means[first : first + IMU_BATCH], strict=True)
-            ]
-            yield Imu(t_ns=ns[-1], source="log", samples=samples)
+
+def imu_batches(t_s: np.ndarray, values: np.ndarray, ns_of: Callable[[float], int], source: str) -> list[Imu]:
+    """``values`` (N, 6): specific force and angular velocity, forward, right, down, at ``t_s``; means of faster ones
+    than MAX_IMU_HZ. ``ns_of``: time of the flight of a ``t_s``."""
+    keep = np.isfinite(values).all(axis=1) & np.isfinite(t_s)
+    keep[1:] &= np.diff(t_s) > 0
+    t_s, values = t_s[keep], values[keep]
+    if len(t_s) < 2:
+        return []
+    mean_of = max(1, round(1.0 / (MAX_IMU_HZ * float(np.median(np.diff(t_s))))))
+    groups = len(t_s) // mean_of
+    times = t_s[: groups * mean_of].reshape(groups, mean_of).mean(axis=1)
+    means = values[: groups * mean_of].reshape(groups, mean_of, 6).mean(axis=1)
+    found = []
+    for first in range(0, groups, IMU_BATCH):
+        ns = [ns_of(float(t)) for t in times[first : first + IMU_BATCH]]
+        samples: list[ImuSample] = [
+            (ns[-1] - t_ns, *map(float, row))  # type: ignore[misc]
+            for t_ns, row in zip(ns, means[first : first + IMU_BATCH], strict=True)
+        ]
+        found.append(Imu(t_ns=ns[-1], source=source, samples=samples))
+    return found
 
 
 def _read(path: Path) -> _Read:

@@ -5,7 +5,7 @@ from typing import Any
 from terrafix.core.exposures import EXPOSURE_KINDS
 from terrafix.core.mavlink.imu import boot_ns
 
-MESSAGE_IDS = frozenset({180, 263, 112})  # [spec: MAVLink common.xml and ardupilotmega.xml]
+EXPOSURE_MESSAGE_IDS = frozenset({180, 263, 112})  # [spec: MAVLink common.xml and ardupilotmega.xml]
 NO_IMAGE = 0  # capture_result [spec: MAVLink common.xml]
 
 

@@ -186,7 +186,7 @@ def camera_of(path: Path, description: Description) -> Camera:
     Raises SourceError: no [camera], or implausible values."""
     if description.camera is None:
         raise SourceError(f"{path}: there is no [camera]; add one with width, height, fx, fy, cx, cy in pixels")
-    c, m = description.camera, description.mount
+    c = description.camera
     circle = FULL_FOV_DEG if c.fov_deg is None else c.fov_deg
     kind = partial(FisheyeCamera, fov_deg=circle) if c.model == "fisheye" else Camera
     camera = kind(
@@ -198,15 +198,23 @@ def camera_of(path: Path, description: Description) -> Camera:
         cy=c.cy,
         distortion=c.distortion,
         focal_sigma=c.focal_sigma or (CALIBRATED_FOCAL_SIGMA if c.distortion else FOCAL_SIGMA),
-        mount_yaw_deg=m.yaw_deg,
-        mount_pitch_deg=m.pitch_deg,
-        mount_roll_deg=m.roll_deg,
-        mount_tolerance_deg=m.tolerance_deg,
-        gimbal=_gimbal(m),
         readout_s=1e-3 * c.readout_ms or UNSET,
     )
-    check_camera(path, view_of(camera))
-    return camera
+    return with_mount(path, camera, description.mount)
+
+
+def with_mount(path: Path, camera: Camera, mount: MountTable) -> Camera:
+    """``camera`` on ``mount``. Raises SourceError: implausible values of either; ``path``: where they come from."""
+    mounted = msgspec.structs.replace(
+        camera,
+        mount_yaw_deg=mount.yaw_deg,
+        mount_pitch_deg=mount.pitch_deg,
+        mount_roll_deg=mount.roll_deg,
+        mount_tolerance_deg=mount.tolerance_deg,
+        gimbal=_gimbal(mount),
+    )
+    check_camera(path, view_of(mounted))
+    return mounted
 
 
 def _gimbal(mount: MountTable) -> Gimbal | UnsetType:

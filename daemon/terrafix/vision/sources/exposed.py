@@ -8,10 +8,11 @@ import numpy as np
 
 from terrafix.core import logs
 from terrafix.core.exposures import EXPOSURE_KINDS, Matched, match_exposures
-from terrafix.messages import STAMP_SIGMA_S, Exposure, Frame
-from terrafix.vision.sources.facts import Fact
+from terrafix.messages import STAMP_SIGMA_S, Exposure, Fact, Frame
 
-WINDOW = 60  # newest frames and reports that are compared: half a minute at 2 Hz [spec: MIN_FRAMES and lost ones]
+WINDOW = (
+    60  # newest frames and reports that are compared: half a minute at 2 Hz [spec: MIN_EXPOSED_FRAMES and lost ones]
+)
 TOLD_FRAMES = 20  # after which it is told that nothing fits [spec: a third of WINDOW]
 FOLDER_SIGMA_S = 1.0  # of the stamps in a table against the clock of its log [spec: EXIF has whole seconds]
 

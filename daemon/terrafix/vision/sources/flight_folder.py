@@ -8,12 +8,11 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Frame, GimbalAttitude, Imu, Origin, VehicleState
+from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
 from terrafix.vision.sources.exposed import exposed_times
 from terrafix.vision.sources.facts import (
-    Fact,
     camera_facts,
     log_facts,
     mount_fact,
