@@ -1,5 +1,8 @@
 """Frames at the exposures that the autopilot reports: in a log beside the flight, and live."""
 
+import queue
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +20,14 @@ from autopilot_logs import (
     write_ulog,
 )
 from autopilot_logs import flight as attitudes
+from flight_records import origin
 from source_folders import flight as write_folder
-from terrafix.link.autopilot.telemetry import TelemetryDecoder
+from terrafix.core.frames import MemoryFrameStore
+from terrafix.link.autopilot.packet_decoder import PacketDecoder
 from terrafix.link.mavlink.timesync import TimeSync
-from terrafix.messages import STAMP_SIGMA_S, Exposure, Frame
+from terrafix.messages import STAMP_SIGMA_S, Exposure, Frame, Origin
+from terrafix.vision.edge import SourceEdge
+from terrafix.vision.sources import Shot
 from terrafix.vision.sources.exposed import ReportedExposures
 from terrafix.vision.sources.facts import facts_of
 from terrafix.vision.sources.flight_folder import FlightFolder
@@ -90,10 +97,9 @@ def test_a_live_camera_gets_the_times_of_reports_that_come_before_or_after_its_i
         if i % 4:  # each fourth report is late by more than the image
             exposed.add(Exposure(t_ns=round(t_s * 1e9), kind="CAMERA_FEEDBACK", number=i))
         stamp_s = t_s + 0.25 + float(RNG.normal(0.0, 0.01))
-        frame = Frame(t_ns=round(stamp_s * 1e9), frame_id=i, file="", width=1, height=1, buffered=True)
-        got = exposed.exposed(
-            frame := Frame(**{f: getattr(frame, f) for f in frame.__struct_fields__} | {"stamp_sigma_s": 0.2})
-        )
+        stamp_ns = round(stamp_s * 1e9)
+        frame = Frame(t_ns=stamp_ns, frame_id=i, file="", width=1, height=1, buffered=True, stamp_sigma_s=0.2)
+        got = exposed.exposed(frame)
         times_s.append(got.t_ns * 1e-9)
         if not i % 4:
             exposed.add(Exposure(t_ns=round(t_s * 1e9), kind="CAMERA_FEEDBACK", number=i))
@@ -105,8 +111,57 @@ def test_a_live_camera_gets_the_times_of_reports_that_come_before_or_after_its_i
 
 
 def test_reports_of_the_autopilot_are_on_the_clock_of_its_telemetry() -> None:
-    decoder = TelemetryDecoder(TimeSync())
+    decoder, now_ns = PacketDecoder(TimeSync()), 9_000_000_000
     message = mavlink.MAVLink_camera_trigger_message(5_000_000, 7)
-    assert decoder.on_exposure(message, 9_000_000_000) == Exposure(t_ns=9_000_000_000, kind="CAMERA_TRIGGER", number=7)
+    exposure = Exposure(t_ns=now_ns, kind="CAMERA_TRIGGER", number=7)
+    assert list(decoder.on_message(message, now_ns, None)) == [exposure]
     failed = mavlink.MAVLink_camera_image_captured_message(5000, 0, 0, 0, 0, 0, 0, [1.0, 0, 0, 0], 3, 0, b"")
-    assert decoder.on_exposure(failed, 9_000_000_000) is None
+    assert not list(decoder.on_message(failed, now_ns, None))
+
+
+def test_a_latency_longer_than_a_frame_does_not_turn_the_order_of_frames() -> None:
+    exposed, times_s = ReportedExposures(), []
+    for i, t_s in enumerate(EXPOSED_S.tolist()):
+        exposed.add(Exposure(t_ns=round(t_s * 1e9), kind="CAMERA_TRIGGER", number=i))
+        stamp_ns = round((t_s + 1.2) * 1e9)
+        frame = Frame(t_ns=stamp_ns, frame_id=i, file="", width=1, height=1, buffered=True, stamp_sigma_s=0.5)
+        times_s.append(exposed.exposed(frame).t_ns * 1e-9)
+    assert np.diff(times_s).min() > 0.3
+
+
+class FedCamera:
+    """A live camera that gives the frames that are put into ``queue``."""
+
+    live = True
+
+    def __init__(self) -> None:
+        self.queue: queue.Queue[Frame | None] = queue.Queue()
+
+    def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
+        while (frame := self.queue.get()) is not None:
+            yield Shot(frame, (), None)
+
+    def origin(self) -> Origin:
+        return origin()
+
+    def length(self) -> None:
+        return None
+
+    def close(self) -> None:
+        self.queue.put(None)
+
+
+def test_the_edge_of_vision_publishes_frames_at_the_exposures_that_it_hears_of() -> None:
+    camera, got = FedCamera(), list[int]()
+    edge = SourceEdge(camera, MemoryFrameStore(), None, False)  # type: ignore[arg-type]
+    try:
+        for i, t_s in enumerate(EXPOSED_S[:8].tolist()):
+            edge.on_message(Exposure(t_ns=round(t_s * 1e9), kind="CAMERA_FEEDBACK", number=i))
+            stamp_ns = round((t_s + 0.1) * 1e9)
+            camera.queue.put(Frame(t_ns=stamp_ns, frame_id=i, file="", width=1, height=1, stamp_sigma_s=0.2))
+            until_s = time.monotonic() + 10.0
+            while len(got) <= i and time.monotonic() < until_s:
+                got += [message.t_ns for message in edge.poll(0) if isinstance(message, Frame)]
+    finally:
+        edge.close()
+    assert got[-1] == round(EXPOSED_S[7] * 1e9)
