@@ -35,6 +35,7 @@ ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.VehicleState,
     m.Imu,
     m.GimbalAttitude,
+    m.Exposure,
     m.SourceEnded,
     m.Odometry,
     m.Relocalization,
@@ -100,6 +101,7 @@ PROCESSES: tuple[Process, ...] = (
             m.VehicleState,
             m.Imu,
             m.GimbalAttitude,
+            m.Exposure,
             m.PositionHint,
             m.EkfDeadReckoning,
             m.GpsInput,
@@ -179,7 +181,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "vision",
         "terrafix.vision.node",
-        (m.Origin, m.Frame, m.Health),
+        (m.Origin, m.Frame, m.Health, m.Exposure),
         (
             m.Origin,
             m.SourceFacts,

@@ -29,8 +29,8 @@ EXTRAS = {
         "fastapi", "starlette", "uvicorn", "sqlalchemy", "python_multipart", "pydantic",
         "terrafix_tools.console",
     ),
-    "rosbag": ("rosbags",),
     "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "yaml", "terrafix_"),
+    "rosbag": ("rosbags",),
 }  # fmt: skip
 # a full disk, or one over its quota
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
@@ -38,6 +38,8 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 # Commands of modules of their own: a function, or a Typer app with commands below it. Imported when they are called, so
 # that a start in flight is fast. The lab is named here and imported by nothing: it may not be installed.
 MODULES = {
+    "init": "terrafix_tools.configuration.cli:init",
+    "config": "terrafix_tools.configuration.cli:app",
     "preflight": "terrafix_tools.preflight.cli:preflight",
     "status": "terrafix_tools.status.cli:status",
     "hint": "terrafix_tools.hint.cli:hint",
@@ -64,7 +66,7 @@ MODULES = {
 # Of the help, in the order of a flight. A command that is in none is a mistake (tests/unit/project/test_cli_help.py).
 GROUPS = {
     "Fly": ("run", "status", "hint"),
-    "Before a flight": ("preflight", "camera", "source", "files", "models"),
+    "Before a flight": ("init", "config", "preflight", "camera", "source", "files", "models"),
     "After a flight": ("replay", "report", "evaluate", "finalise", "log", "compare", "locate", "fleet"),
     "Photos and flights over HTTP": ("serve", "flight"),
     "Maps": ("map",),
@@ -313,7 +315,9 @@ def main(fork_server: "ForkServer | None" = None) -> None:
         if not extra:
             raise
         missing = "terrafix-ground" if name.startswith("terrafix") else name.split(".")[0]
-        typer.echo(f"terrafix: this command needs {missing}; install it: pip install 'terrafix[{extra}]'", err=True)
+        from terrafix_tools.installation import install_command
+
+        typer.echo(f"terrafix: this command needs {missing}; install it: {install_command(extra)}", err=True)
         sys.exit(UsageError.exit_code)
 
 

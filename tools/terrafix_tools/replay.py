@@ -13,10 +13,11 @@ from typing import Any
 
 import msgspec
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, ModelError, UsageError
+from terrafix.core.flight_id import recorded_flight_id
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import start_is_unknown, with_map_center
@@ -36,6 +37,7 @@ from terrafix_tools.in_process import InProcessShell
 from terrafix_tools.likely_cause import UNMEASURED
 from terrafix_tools.live import swapped_hint
 from terrafix_tools.map_probe import likely_factor
+from terrafix_tools.progress import LineProgress
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.rerun.frames import RecordedFrames
 from terrafix_tools.source.text import fact_lines
@@ -87,6 +89,10 @@ def replay(
     opened, source = flight, wrap_source(flight)
     package = package_of(_map_of(map_path, config, source), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
+    if not origin.flight_id:
+        first = next(opened.shots(), None)
+        flight_id = recorded_flight_id(origin, None if first is None else first.image)
+        origin = msgspec.structs.replace(origin, flight_id=flight_id)
     facts = facts_of(opened)
     if progress:
         for line in fact_lines(source.name(), facts):
@@ -261,7 +267,7 @@ def _not_covered(origin: Origin, bounds_m: tuple[float, float, float, float]) ->
 @contextmanager
 def _bar(shown: bool, total: int | None) -> Iterator[Callable[[], None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+    with LineProgress(*columns, console=Console(stderr=True), shown=shown) as progress:
         task = progress.add_task("replay", total=total)
         yield lambda: progress.advance(task)
 

@@ -41,7 +41,7 @@ class FlightWriter:
         self._sequence = 0
         for message_type in MESSAGE_TYPES.values():
             self._register(topic_of(message_type), f"terrafix.{message_type.__name__}", schema_of(message_type))
-        for topic in foxglove.CHANNELS:
+        for topic in foxglove.FOXGLOVE_CHANNELS:
             self._register(topic, foxglove.schema_name(topic), foxglove.schema_of(topic))
         self._foxglove = FoxgloveMessages()
         self.flush()

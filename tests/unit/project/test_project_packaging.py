@@ -16,6 +16,7 @@ from packaging.utils import canonicalize_name
 
 import terrafix
 from terrafix.core.errors import MapError
+from terrafix_tools.installation import install_command
 
 ROOT = Path(__file__).resolve().parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -46,6 +47,7 @@ IMPORTED_AS = {
     "faiss-cpu": "faiss",
     "systemd-python": "systemd",
     "pygobject": "gi",
+    "jsonschema-rs": "jsonschema_rs",
 }
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # used by scripts/check or the build
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
@@ -89,6 +91,14 @@ def test_what_flies_starts_without_faiss() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_what_flies_starts_without_the_tests_that_gtsam_brings() -> None:
+    """systemd/install.sh takes pytest away from a vehicle."""
+    without = "import sys; sys.modules.update(dict.fromkeys(('pytest', '_pytest', 'pluggy', 'iniconfig')))"
+    code = f"{without}; import terrafix.estimator.node, terrafix.smoother.node"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert "uninstall --yes pytest pluggy iniconfig" in (ROOT / "systemd" / "install.sh").read_text(encoding="utf-8")
+
+
 @pytest.mark.slow
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
@@ -112,9 +122,9 @@ def test_every_dependency_has_a_version_range() -> None:
                 "faiss",
                 "fleet",
                 "console",
+                "rosbag",
                 "vehicle",
                 "gstreamer",
-                "rosbag",
                 "train",
             )
             for one in EXTRAS[extra].values()
@@ -188,7 +198,7 @@ def test_without_the_ground_extra_one_line_states_what_to_install(command: str) 
     code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "terrafix: this command needs rasterio; install it: pip install 'terrafix[ground]'\n"
+    assert done.stderr == f"terrafix: this command needs rasterio; install it: {install_command('ground')}\n"
 
 
 def test_without_gdal_a_map_package_is_enough_for_replay_run_and_report() -> None:
@@ -248,11 +258,11 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
     folders = {path.name for path in (unpacked / "terrafix_tools").iterdir()} | {
         path.name for path in unpacked.iterdir()
     }
-    assert not folders & {"terrafix_lab", "console", "fleet", "finalise", "compare", "locate", "parallel"}
+    assert not folders & {"terrafix_lab", "console", "export", "fleet", "finalise", "compare", "locate", "parallel"}
     assert not (unpacked / "terrafix_engines" / "train").exists()
     shown = in_wheel(unpacked, "--help")
     commands = [line.split()[1] for line in shown.stdout.splitlines() if re.match(r"│ [a-z]", line)]
-    at_it = "run status hint preflight camera source files models replay report evaluate log map"
+    at_it = "run status hint init config preflight camera source files models replay report evaluate log map"
     assert commands == at_it.split(), shown.stderr
     status = in_wheel(unpacked, "status", "--run", "nowhere")
     assert status.returncode == 2 and status.stderr.startswith("terrafix: nowhere: no such folder; omit --run")
@@ -271,7 +281,8 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
 def test_a_command_that_a_vehicle_does_not_have_says_what_to_install(unpacked: Path, words: str, extra: str) -> None:
     done = in_wheel(unpacked, *words.split())
     assert done.returncode == 2
-    assert done.stderr == f"terrafix: this command needs terrafix-ground; install it: pip install 'terrafix[{extra}]'\n"
+    pip = f"{sys.executable} -m pip install"
+    assert done.stderr == f"terrafix: this command needs terrafix-ground; install it: {pip} 'terrafix[{extra}]'\n"
 
 
 def test_a_geotiff_on_a_vehicle_is_one_line(unpacked: Path, tmp_path: Path) -> None:
@@ -279,7 +290,7 @@ def test_a_geotiff_on_a_vehicle_is_one_line(unpacked: Path, tmp_path: Path) -> N
     flight = ("--source", "/dev/video0", "--map", str(tmp_path / "map.tif"), "--out", str(tmp_path / "out"))
     done = in_wheel(unpacked, "run", *flight)
     assert done.returncode == MapError.exit_code
-    assert re.fullmatch(r"terrafix: \S+/map.tif: no map package .* pip install 'terrafix\[ground\]'\n", done.stderr)
+    assert re.fullmatch(r"terrafix: \S+/map.tif: no map package .* pip install .*\[ground\]'.*\n", done.stderr)
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from terrafix.core.errors import OutputError, SourceError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import Edge, NodeContext
 from terrafix.recorder.images import ImagePolicy
-from terrafix.recorder.node import QUEUE_LENGTH, RecorderEdge, make_edge
+from terrafix.recorder.node import RECORD_QUEUE_LENGTH, RecorderEdge, make_edge
 from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images, read_thumbnails
 from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
@@ -219,7 +219,7 @@ def test_a_blocked_disk_does_not_block_the_recorder_and_losses_are_recorded(tmp_
     ring = BlockedRing(tmp_path)
     edge = RecorderEdge(ring, MemoryFrameStore(1), ImagePolicy(RecorderSection(frames="none")))
     began = time.monotonic()
-    for i in range(QUEUE_LENGTH + 500):
+    for i in range(RECORD_QUEUE_LENGTH + 500):
         edge.on_message(estimate(i, 0.0, 0.0))
     assert time.monotonic() - began < 2.0
     ring.unblock.set()
@@ -228,7 +228,7 @@ def test_a_blocked_disk_does_not_block_the_recorder_and_losses_are_recorded(tmp_
     lost = sum(x.count for x in messages if isinstance(x, m.Dropped))
     kept = sum(isinstance(x, m.NavEstimate) for x in messages)
     assert 490 <= lost <= 500
-    assert kept + lost == QUEUE_LENGTH + 500
+    assert kept + lost == RECORD_QUEUE_LENGTH + 500
 
 
 def test_frames_get_thumbnails_unless_their_pixels_are_gone(tmp_path: Path) -> None:

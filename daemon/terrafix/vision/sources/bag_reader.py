@@ -20,7 +20,7 @@ MAVROS = {
     "float32 angular_velocity_y\nfloat32 angular_velocity_z\nuint32 failure_flags\n",
 }
 # What rosbags and its storages raise for damaged files beside their own exceptions.
-_DAMAGE = (
+_BAG_DAMAGE = (
     ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError,
     TypeError, ValueError, struct.error,
 )  # fmt: skip
@@ -41,7 +41,7 @@ class BagReader:
                 f"{path}: reading a bag needs {error.name}; install it with: pip install 'terrafix[rosbag]'"
             ) from None
         bags = rosbag1.ReaderError, rosbag2.ReaderError
-        self._damage = (*_DAMAGE, *bags, AnyReaderError, SerdeError, TypesysError)
+        self._damage = (*_BAG_DAMAGE, *bags, AnyReaderError, SerdeError, TypesysError)
         store = get_typestore(Stores.ROS2_HUMBLE)
         for name, text in MAVROS.items():
             store.register(get_types_from_msg(text, name))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from terrafix.core.errors import SourceError
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-QUATERNION, DEVICE = "geometry_msgs/msg/Quaternion", "mavros_msgs/msg/GimbalDeviceAttitudeStatus"
+QUATERNION, GIMBAL_DEVICE = "geometry_msgs/msg/Quaternion", "mavros_msgs/msg/GimbalDeviceAttitudeStatus"
 
 MCAP_HEAD = b"\x89MCAP0\r\n\x01"  # magic, opcode of the header
 PROFILE_AT = 17 + 4  # after the opcode: length of the header, length of the profile [spec: mcap.dev/spec]
@@ -24,14 +24,14 @@ class Kind(NamedTuple):
 
 
 # Names are those of mavros (mavros and mavros_extras, plugins imu, global_position, altitude, mount_control).
-KINDS: dict[str, Kind] = {
+TOPIC_KINDS: dict[str, Kind] = {
     "image": Kind((IMAGE, COMPRESSED)),
     "camera_info": Kind(("sensor_msgs/msg/CameraInfo",)),
     "imu": Kind(("sensor_msgs/msg/Imu",), preferred="/imu/data"),
     "heading": Kind((), (("std_msgs/msg/Float64", "/compass_hdg"),)),
     "height": Kind(("mavros_msgs/msg/Altitude",), (("std_msgs/msg/Float64", "/rel_alt"),)),
     "state": Kind(("mavros_msgs/msg/State",)),
-    "gimbal": Kind((DEVICE,), ((QUATERNION, "/mount_control/orientation"),)),
+    "gimbal": Kind((GIMBAL_DEVICE,), ((QUATERNION, "/mount_control/orientation"),)),
     "truth": Kind(("sensor_msgs/msg/NavSatFix",), preferred="/global_position/global"),
 }
 
@@ -52,10 +52,10 @@ def choose_topics(path: Path, types: Mapping[str, str], chosen: Mapping[str, str
     topic of each kind that there is. Raises SourceError: a topic or kind that is not there, several that could be
     meant, no images."""
     for kind in chosen:
-        if kind not in KINDS:
-            raise SourceError(f"{path}: [source] topics has '{kind}'; known are {', '.join(KINDS)}")
+        if kind not in TOPIC_KINDS:
+            raise SourceError(f"{path}: [source] topics has '{kind}'; known are {', '.join(TOPIC_KINDS)}")
     found: dict[str, str] = {}
-    for kind, of in KINDS.items():
+    for kind, of in TOPIC_KINDS.items():
         topic = chosen[kind] if kind in chosen else _only(path, kind, _candidates(of, types), found)
         if topic and topic not in types:
             raise SourceError(f"{path}: has no topic {topic}; it has {', '.join(sorted(types))}")

@@ -63,6 +63,8 @@ class CameraTable(_Table, frozen=True, kw_only=True):
     fov_deg: Annotated[float, Meta(gt=0, le=360)] | None = (
         None  # circle that a fisheye images, if smaller than the image
     )
+    # Rolling shutter: from the exposure of the first row to that of the last; negative: the last row is first
+    readout_ms: Annotated[float, Meta(ge=-200, le=200)] = 0.0
 
     @classmethod
     def of(cls, camera: Camera) -> "CameraTable":
@@ -78,6 +80,7 @@ class CameraTable(_Table, frozen=True, kw_only=True):
             focal_sigma=camera.focal_sigma,
             model="fisheye" if isinstance(camera, FisheyeCamera) else "pinhole",
             fov_deg=camera.fov_deg if isinstance(camera, FisheyeCamera) and camera.fov_deg < FULL_FOV_DEG else None,
+            readout_ms=1e3 * (camera.readout_s or 0.0),
         )
 
 
@@ -195,6 +198,7 @@ def camera_of(path: Path, description: Description) -> Camera:
         cy=c.cy,
         distortion=c.distortion,
         focal_sigma=c.focal_sigma or (CALIBRATED_FOCAL_SIGMA if c.distortion else FOCAL_SIGMA),
+        readout_s=1e-3 * c.readout_ms or UNSET,
     )
     return with_mount(path, camera, description.mount)
 
@@ -254,10 +258,11 @@ def origin_of(
 
 
 def telemetry_log(
-    stem: Path, description: Description, states: Sequence[VehicleState] = ()
+    stem: Path, description: Description, states: Sequence[VehicleState] = (), frames_s: Sequence[float] = ()
 ) -> "TelemetryLog | OwnLog | None":
     """The log beside a flight: ``stem`` with one of LOG_SUFFIXES; None: there is none. Zero and vehicle are those that
-    the description states; ``states``: of the frames, by which the clock of an autopilot's own log is aligned.
+    the description states. The clock of an autopilot's own log is aligned by ``states``, those of the frames, or by
+    their stamps ``frames_s``.
 
     Raises SourceError: it cannot be used, or there are several."""
     found = [stem.with_suffix(suffix) for suffix in LOG_SUFFIXES if stem.with_suffix(suffix).is_file()]
@@ -271,7 +276,7 @@ def telemetry_log(
         return TelemetryLog(found[0], description.telemetry.tlog_t0_us, description.telemetry.system_id)
     from terrafix.core.autopilot_log.own_log import OwnLog
 
-    return OwnLog(found[0], description.telemetry.log_zero_s, states)
+    return OwnLog(found[0], description.telemetry.log_zero_s, states, frames_s)
 
 
 def _check_numbers(path: Path, table: dict[str, Any], where: str = "") -> None:

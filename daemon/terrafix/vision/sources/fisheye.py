@@ -59,6 +59,7 @@ def view_of(camera: Camera) -> Camera:
         mount_roll_deg=camera.mount_roll_deg,
         mount_tolerance_deg=camera.mount_tolerance_deg,
         gimbal=camera.gimbal,
+        readout_s=camera.readout_s,
     )
 
 

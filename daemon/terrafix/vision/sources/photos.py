@@ -72,6 +72,11 @@ class Photos:
     def origin(self) -> Origin:
         return self._origin
 
+    @property
+    def stored(self) -> Camera:
+        """The camera of the photos as they are stored."""
+        return self._stored
+
     def length(self) -> int | None:
         return len(self._photos)
 
