@@ -2,6 +2,7 @@
 
 import builtins
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 pytest.importorskip("rosbags", reason="needs rosbags: pip install 'terrafix[rosbag]'")
+
+from rosbags import rosbag1
 
 from ros_bags import (
     BEGAN_NS,
@@ -166,6 +169,12 @@ def test_a_description_beside_the_bag_is_before_camera_info(bags: dict[str, Path
     assert "[camera] of b.toml" in said(source)
 
 
+def damaged_chunk(*_: Any, **__: Any) -> Iterator[Any]:
+    """What rosbags raises while it reads a chunk with a wrong length in it."""
+    yield from ()
+    raise rosbag1.ReaderError("Got only 5 of 9 bytes")
+
+
 def test_damaged_and_foreign_bags_are_one_clear_line(
     bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -179,6 +188,10 @@ def test_damaged_and_foreign_bags_are_one_clear_line(
         with pytest.raises(SourceError, match=rf"{name}: the bag cannot be read \(") as caught:
             open_source(str(tmp_path / name))
         assert "\n" not in str(caught.value)
+    with monkeypatch.context() as patched:
+        patched.setattr(rosbag1.Reader, "messages", damaged_chunk)
+        with pytest.raises(SourceError, match=r"flight-ros1.bag: the bag cannot be read \(Got only 5 of 9 bytes\)"):
+            open_source(str(bags["ros1"]))
     blind = write_bag(tmp_path / "blind.bag", "ros1", cameras=0)
     with pytest.raises(SourceError, match=r"has no images .*; it has /mavros/battery_hint \(std_msgs/msg/Float64\)"):
         open_source(str(blind))

@@ -32,13 +32,16 @@ class BagReader:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
+            from rosbags import rosbag1, rosbag2
             from rosbags.highlevel import AnyReader, AnyReaderError
-            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+            from rosbags.serde import SerdeError
+            from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
         except ModuleNotFoundError as error:
             raise SourceError(
                 f"{path}: reading a bag needs {error.name}; install it with: pip install 'terrafix[rosbag]'"
             ) from None
-        self._damage = (*_BAG_DAMAGE, AnyReaderError)
+        bags = rosbag1.ReaderError, rosbag2.ReaderError
+        self._damage = (*_BAG_DAMAGE, *bags, AnyReaderError, SerdeError, TypesysError)
         store = get_typestore(Stores.ROS2_HUMBLE)
         for name, text in MAVROS.items():
             store.register(get_types_from_msg(text, name))
