@@ -22,6 +22,8 @@ from terrafix.recorder.reader import ReadResult, read_flight, read_thumbnails
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.log.show import Selection, follow
+from terrafix_tools.mission.file import read_mission
+from terrafix_tools.mission.items import AltitudeFrame, Do
 
 FRAMES = 20
 LOCATED = FRAMES - 1  # the first frame has no position
@@ -187,6 +189,18 @@ def test_csv_and_parquet_have_the_positions(record: Path, tmp_path: Path) -> Non
     assert table["refined_lat_deg"][0] is None and table["time_utc"][0] == "2026-07-03T12:00:00.500+00:00"
 
 
+def test_a_waypoint_file_has_the_newest_position_of_each_frame_at_its_height(tmp_path: Path) -> None:
+    pose = m.RefinedPose(frame_id=2, lat_deg=48.5, lon_deg=11.5, alt_amsl_m=612.0, sigma_e_m=1.0, sigma_n_m=1.0)
+    write_record(tmp_path / "flight.mcap", [*live_messages(FRAMES), m.Refinement(t_ns=0, poses=[pose])])
+    call("export", tmp_path / "flight.mcap", tmp_path / "track.waypoints")
+    mission = read_mission(tmp_path / "track.waypoints")
+    assert len(mission.items) == LOCATED and {item.do for item in mission.items} == {Do.WAYPOINT}
+    assert {item.altitude_frame for item in mission.items} == {AltitudeFrame.SEA}
+    first, second = mission.items[:2]
+    assert (second.lat_deg, second.lon_deg, second.height_m) == (48.5, 11.5, 612.0)
+    assert (first.lat_deg, first.lon_deg) == (mission.home_lat_deg, mission.home_lon_deg) != (48.5, 11.5)
+
+
 def test_without_a_wall_clock_an_export_has_no_time(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", live_messages(FRAMES))
     call("export", tmp_path / "flight.mcap", tmp_path / "track.parquet")
@@ -197,7 +211,9 @@ def test_without_a_wall_clock_an_export_has_no_time(tmp_path: Path) -> None:
 
 def test_an_unknown_format_and_a_folder_that_is_missing_are_one_line(record: Path, tmp_path: Path) -> None:
     unknown = call("export", record, tmp_path / "track.shp").exception
-    assert isinstance(unknown, UsageError) and "use .csv, .geojson, .gpkg, .gpx, .kml, .kmz, .parquet" in str(unknown)
+    assert isinstance(
+        unknown, UsageError
+    ) and "use .csv, .geojson, .gpkg, .gpx, .kml, .kmz, .parquet, .waypoints" in str(unknown)
     for suffix in ("csv", "gpkg", "parquet"):
         assert isinstance(call("export", record, tmp_path / "none" / f"track.{suffix}").exception, OutputError)
 

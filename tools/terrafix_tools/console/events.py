@@ -27,6 +27,15 @@ class FrameRefined(Event, CameraPose):
     fragment_id: int
 
 
+class WaypointsUpdated(Event):
+    """The positions of past frames have changed: ``url`` has the newest of all frames as a waypoint file."""
+
+    frames: int  # that have changed
+    first_frame: int  # of them
+    last_frame: int
+    url: str
+
+
 class SearchExpanded(Event):
     """Lost: the search has reached another size. ``grid_size``: tiles, 1 to 25; None: the whole map."""
 
@@ -142,6 +151,7 @@ class Health(Event):
 EVENTS: tuple[type[Event], ...] = (
     FrameProcessed,
     FrameRefined,
+    WaypointsUpdated,
     SearchExpanded,
     UserInputNeeded,
     ProcessingBlocked,

@@ -16,6 +16,7 @@ from terrafix.messages import WallClock
 from terrafix.recorder.reader import is_record, read_flight
 from terrafix_tools.estimates import NS, Row, write_rows
 from terrafix_tools.evaluate import flight_rows
+from terrafix_tools.mission.file import track_mission, write_mission
 
 WGS84 = "EPSG:4326"
 POINT_Z, LINE_Z = 1001, 1002  # ISO WKB geometry types
@@ -30,6 +31,7 @@ def export(folder: Path, out: Path) -> int:
         ".parquet": _write_parquet,
         ".gpx": _write_gpx,
         ".kmz": _write_kmz,
+        ".waypoints": _write_waypoints,
         **dict.fromkeys(DRIVERS, _write_features),
     }
     write = writers.get(out.suffix.lower())
@@ -116,6 +118,19 @@ def _write_gpx(rows: list[Row], times: list[str | None], out: Path) -> None:
         data.append(np.array([str(time)[:23] for time in times], dtype="datetime64[ms]"))
     geometry = np.array([_point(row) for row in rows], dtype=object)
     _write(out, "track_points", geometry, "Point Z", names, data, "GPX")
+
+
+def _write_waypoints(rows: list[Row], times: list[str | None], out: Path) -> None:
+    """The newest position of each frame, for a ground station."""
+    write_mission(out, track_mission(out.name, [_newest(row) for row in rows]))
+
+
+def _newest(row: Row) -> tuple[float, float, float | None]:
+    """Latitude, longitude, height above mean sea level: refined, where there is a refined position."""
+    if row.refined_lat_deg is not None and row.refined_lon_deg is not None:
+        return row.refined_lat_deg, row.refined_lon_deg, row.refined_alt_amsl_m
+    assert row.lat_deg is not None and row.lon_deg is not None
+    return row.lat_deg, row.lon_deg, row.alt_amsl_m
 
 
 def _field_data(columns: dict[str, list[Any]]) -> tuple[list[str], list[np.ndarray]]:
