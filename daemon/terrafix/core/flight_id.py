@@ -8,13 +8,13 @@ import numpy as np
 from terrafix.core.codec import encode
 from terrafix.messages import Origin
 
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # UUID of this start of the computer [spec: proc_sys_kernel(5)]
+BOOT_ID_FILE = Path("/proc/sys/kernel/random/boot_id")  # UUID of this start of the computer [spec: proc_sys_kernel(5)]
 RECORDINGS = uuid.UUID("684103f7-867f-415a-b086-96d3fd85fb1a")  # name space of the ids of recordings
 
 
 def live_flight_id(zero_ns: int) -> str:
     """UUID of a live flight by the monotonic time of its zero, which a restart of its processes keeps."""
-    return str(uuid.uuid5(uuid.UUID(BOOT_ID.read_text(encoding="ascii").strip()), str(zero_ns)))
+    return str(uuid.uuid5(uuid.UUID(BOOT_ID_FILE.read_text(encoding="ascii").strip()), str(zero_ns)))
 
 
 def recorded_flight_id(origin: Origin, first: np.ndarray | None) -> str:

@@ -79,7 +79,7 @@ def test_the_map_error_is_judged_by_one_rule_also_where_that_gives_the_larger_nu
 def test_few_matches_of_a_warped_map_decide_only_what_its_distortion_cannot_change(
     noise_m: float, verdict: RowVerdict | None
 ) -> None:
-    """Three frames over a map whose distortion is above the floor: without it their matches are good or bad."""
+    """Three frames over a map whose distortion is above the floor: without it the matches are good, or bad as well."""
     matches = [match(i, warped=True, noise_m=noise_m) for i in range(3)]
     evidence: Any = SimpleNamespace(
         frames=[SimpleNamespace(match=one, fixed=True) for one in matches],

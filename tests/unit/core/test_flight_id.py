@@ -22,7 +22,7 @@ def test_flights_differ_by_boot_and_zero_and_recordings_by_what_they_show(
     here = live_flight_id(5_000)
     boot = tmp_path / "boot_id"
     boot.write_text("4c3b5e0a-0d5e-4f5e-8a43-7b1d3c0e9f11\n", encoding="ascii")
-    monkeypatch.setattr(flight_id, "BOOT_ID", boot)
+    monkeypatch.setattr(flight_id, "BOOT_ID_FILE", boot)
     ids = [here, live_flight_id(5_000), live_flight_id(5_001)]
     ids += [recorded_flight_id(ORIGIN, image) for image in (None, FIRST, FIRST + 1)]
     assert len({UUID(found) for found in ids}) == len(ids)

@@ -45,9 +45,9 @@ class PacketDecoder:
             if isinstance(state, VehicleState):
                 self._state = state
             yield state
-        gimbal = self.telemetry.on_gimbal(message, now_ns)
-        if gimbal is not None:
-            yield gimbal
+        for other in (self.telemetry.on_gimbal(message, now_ns), self.telemetry.on_exposure(message, now_ns)):
+            if other is not None:
+                yield other
         kind = message.get_type()
         if kind in RECEIVERS and RECEIVERS[kind] != own_receiver:
             yield gnss_reading(message, now_ns)

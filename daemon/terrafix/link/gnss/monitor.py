@@ -29,7 +29,7 @@ from terrafix.messages import (
     VehicleState,
 )
 
-VERDICT_PERIOD_NS = NS_PER_S  # ns; a verdict is published on every change, and in this period [tuned]
+GNSS_VERDICT_PERIOD_NS = NS_PER_S  # ns; a verdict is published on every change, and in this period [tuned]
 # ns for which a step of our own estimate counts as a possible cause of a disagreement. [tuned]
 OWN_STEP_MEMORY_NS = 10 * NS_PER_S
 MIN_FIX_DURATION_NS = 2 * NS_PER_S  # ns with a 3D fix of ours before the autopilot is switched to it [tuned]
@@ -127,9 +127,9 @@ class GnssMonitor:
         return None if uncertain or predicted.age_s > MAX_VISION_AGE_S else predicted
 
     def _publish(self, receiver: int, assessment: Assessment, now_ns: int) -> Iterator[Message]:
-        before, published_ns = self._published.get(receiver, (GnssState.UNKNOWN, -VERDICT_PERIOD_NS))
+        before, published_ns = self._published.get(receiver, (GnssState.UNKNOWN, -GNSS_VERDICT_PERIOD_NS))
         changed = assessment.state is not before
-        if not changed and now_ns - published_ns < VERDICT_PERIOD_NS:
+        if not changed and now_ns - published_ns < GNSS_VERDICT_PERIOD_NS:
             return
         self._published[receiver] = (assessment.state, now_ns)
         yield GnssVerdict(

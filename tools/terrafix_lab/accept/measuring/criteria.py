@@ -96,7 +96,9 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "fix again": ("AC-15", "3D fix and right again after the lie", "s", _most(5.0), None, loop_integrity.fix_again_s),
     "mode": ("ON-2", "frames with the covariance mode that heat asks for", "%", ALL, None, of.right_mode),
 }  # fmt: skip
-SHARED = tuple(name for name in CRITERIA_OF_TRACKS if name not in _ROWS)  # with all campaigns; shown, not judged
+SHARED = tuple(
+    name for name, row in CRITERIA_OF_TRACKS.items() if name not in _ROWS and not row.live
+)  # with all campaigns; shown, not judged
 _ROWS |= {
     name: (
         "AC-15",

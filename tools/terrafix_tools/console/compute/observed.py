@@ -34,6 +34,7 @@ from terrafix_tools.console.events import (
     FrameProcessed,
     FrameRefined,
     HintAnswered,
+    OfFrame,
     ProcessingBlocked,
     RecoveryStarted,
     RecoverySucceeded,
@@ -52,6 +53,7 @@ from terrafix_tools.console.payloads import (
     FrameResult,
     Gps,
     InputRequest,
+    WholeVerdict,
 )
 from terrafix_tools.estimates import yaw_deg_of
 from terrafix_tools.finalised import FinalRow
@@ -108,6 +110,7 @@ class FlightObserver:
         self._refined: list[FrameRefined] = []
         self._scales: dict[int, float] = {}  # by frame: metres per unit, of the newest refinement that states them
         self._frame_of: dict[str, int] = {}  # by file
+        self._file_of: dict[int, str] = {}  # by frame
         self._finalised = 0
 
     def resume(self, state: FlightState) -> None:
@@ -123,7 +126,7 @@ class FlightObserver:
                     self.origin_ns, self.flight_id = message.t_ns, message.flight_id
                 case Frame():
                     self._shown, self._match = message, None
-                    self._frame_of[message.file] = message.frame_id
+                    self._frame_of[message.file], self._file_of[message.frame_id] = message.frame_id, message.file
                 case NavEstimate():
                     self.estimates[message.frame_id] = message
                 case MapMatch():
@@ -162,6 +165,11 @@ class FlightObserver:
         outcome.result, outcome.fragment = result, fragment
         return outcome
 
+    @property
+    def asks(self) -> bool:
+        """A position was asked for, and none has helped yet."""
+        return self._asked
+
     def rest(self) -> FrameOutcome:
         """What messages without a frame add: those after the source has ended."""
         return self._outcome([])
@@ -180,8 +188,8 @@ class FlightObserver:
         refined.frame_uid = frame_uid(self.flight_id, pose.frame_id)
         return refined
 
-    def completed(self, not_finalised: str = "") -> FlightCompleted:
-        """``not_finalised``: why the flight has no solution as a whole."""
+    def completed(self, verdict: WholeVerdict | None = None, not_finalised: str = "") -> FlightCompleted:
+        """``verdict``: on the flight, None: it has no record; ``not_finalised``: why it has no solution as a whole."""
         totals = self._totals
         median = float(np.median(totals.radii_m)) if totals.radii_m else None
         return FlightCompleted(
@@ -195,7 +203,8 @@ class FlightObserver:
                 "hints": totals.hints,
                 "median_radius95_m": None if median is None else round(median, 2),
                 "not_finalised": not_finalised,
-            }
+            },
+            verdict=verdict,
         )
 
     def _outcome(self, events: list[Event]) -> FrameOutcome:
@@ -205,6 +214,9 @@ class FlightObserver:
             span = {"first_frame": min(changed), "last_frame": max(changed)}
             url = f"/flights/{self.flight_id}/waypoints"
             events.append(WaypointsUpdated(frames=len({*changed}), url=url, **span))
+        for event in events:
+            if isinstance(event, (OfFrame, ProcessingBlocked)) and event.frame_id is not None:
+                event.file = self._file_of.get(event.frame_id, "")
         self._totals.refined |= {refined.frame_id for refined in self._refined}
         outcome = FrameOutcome(refined=self._refined, events=events, state=self._state, request=self._request)
         self._others, self._refined = [], []
