@@ -15,8 +15,15 @@ TENSORRT, CUDA, CPU = "TensorrtExecutionProvider", "CUDAExecutionProvider", "CPU
 PREFERENCE = (TENSORRT, CUDA, CPU)
 MEMORY = {TENSORRT: "cuda", CUDA: "cuda", CPU: "cpu"}  # ONNX Runtime's name of the device with a provider's buffers
 READY = "ready.json"  # written after the first successful run of an engine; missing after an interrupted build
+GPU_MEMORY_BYTES = 6 * 2**30  # of all models together [spec: RS-5 of the requirements]
+MODELS = 4  # that a flight opens at most: features of odometry, of the anchor, correlation, places [spec: [models]]
+MODEL_MEMORY_BYTES = GPU_MEMORY_BYTES // MODELS  # arena of a session; workspace of an engine
 # The arena grows by the requested size, not by powers of two: on a Jetson the GPU shares the system's memory.
-CUDA_OPTIONS = {"arena_extend_strategy": "kSameAsRequested", "cudnn_conv_algo_search": "HEURISTIC"}
+CUDA_OPTIONS = {
+    "arena_extend_strategy": "kSameAsRequested",
+    "cudnn_conv_algo_search": "HEURISTIC",
+    "gpu_mem_limit": str(MODEL_MEMORY_BYTES),
+}
 
 Shapes = tuple[tuple[int, ...], ...]  # of all inputs
 Chain = list[str | tuple[str, dict[str, str]]]  # the ``providers`` argument of InferenceSession
@@ -93,6 +100,7 @@ def tensorrt_options(folder: Path, preset: Preset, inputs: tuple[Tensor, ...]) -
         "trt_engine_cache_path": str(folder),
         "trt_timing_cache_enable": "True",
         "trt_timing_cache_path": str(folder.parent),
+        "trt_max_workspace_size": str(MODEL_MEMORY_BYTES),
         "trt_fp16_enable": str(preset.precision == "fp16"),
         "trt_profile_min_shapes": profile,
         "trt_profile_opt_shapes": profile,

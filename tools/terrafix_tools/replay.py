@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from terrafix_tools.live import swapped_hint
 from terrafix_tools.map_probe import likely_factor
 from terrafix_tools.progress import LineProgress
 from terrafix_tools.replay_output import ReplayOutput
+from terrafix_tools.rerun.earlier import REBUILT, EarlierPart, begin_with
 from terrafix_tools.rerun.frames import RecordedFrames
 from terrafix_tools.source.text import fact_lines
 
@@ -54,7 +56,12 @@ Watch = Callable[[list[Message]], None]
 
 def make_nodes(ctx: NodeContext) -> dict[str, Node]:
     """Creates the nodes of the process table that compute the estimate."""
-    return {p.name: importlib.import_module(p.module).make_node(ctx) for p in PROCESSES if p.name in REPLAYED_PROCESSES}
+    made = {}
+    for process in PROCESSES:
+        if process.name in REPLAYED_PROCESSES:
+            rebuilt = replace(ctx, epoch_ns=None) if process.name in REBUILT else ctx  # not as after a restart
+            made[process.name] = importlib.import_module(process.module).make_node(rebuilt)
+    return made
 
 
 def replay(
@@ -70,13 +77,15 @@ def replay(
     nodes: MakeNodes = make_nodes,
     wrap_source: MakeSource = lambda source: source,
     watch: Watch = lambda messages: None,
+    earlier: EarlierPart | None = None,
 ) -> dict[str, Any]:
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
     ``flight``: a source, or its name. ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg), overrides the source's.
     ``topics``: of a bag, by kind.
     ``nodes`` and ``wrap_source`` wrap the nodes and the source (to measure time, to inject faults). ``watch`` gets the
-    messages of the origin, of each frame and of the end, when they are on disk. Raises subclasses of TerrafixError.
+    messages of the origin, of each frame and of the end, when they are on disk. ``earlier``: what an ended replay has
+    computed; the source begins after it. Raises subclasses of TerrafixError.
     """
     began_s = time.perf_counter()
     config = _with_models(load(configs or []), models or [])
@@ -99,11 +108,32 @@ def replay(
             Console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)
     with ReplayOutput(out, header(config, package.resolve()), config.recorder) as output:
         frames = MemoryFrameStore(FRAMES_KEPT)
-        ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
+        ctx = NodeContext(
+            config=config,
+            frames=frames,
+            map_path=package.resolve(),
+            out_dir=out.resolve(),
+            epoch_ns=None if earlier is None else origin.t_ns,
+        )
         published: list[Message] = []
-        shell = InProcessShell(nodes(ctx), lambda _who, message: published.append(message))
-        said = SourceFacts(t_ns=origin.t_ns, facts=tuple(facts))
-        _feed_flight(source, origin, said, shell, frames, published, output, watch, progress)
+        made = nodes(ctx)
+        shell = InProcessShell(made, lambda _who, message: published.append(message))
+
+        def step_done() -> None:
+            output.take(published)
+            watch(published)
+            published.clear()
+
+        if earlier is None:
+            begun = 0, origin.t_ns
+            shell.feed(origin)
+            shell.feed(SourceFacts(t_ns=origin.t_ns, facts=tuple(facts)))
+            step_done()
+        else:
+            begun = earlier.frames, begin_with(earlier, made, published, step_done)
+            output.copy_images(earlier.record)
+            earlier.record.unlink()
+        _feed_flight(source, begun, shell, frames, published, output, watch, progress)
         counts = output.counts()
         if UNMEASURED in counts["verdict"]["cause"] and not isinstance(opened, RecordedFrames):
             counts = output.counts(likely_factor(opened.shots(), origin, package))
@@ -139,8 +169,7 @@ def peak_memory_mb() -> float:
 
 def _feed_flight(
     source: Source,
-    origin: Origin,
-    said: SourceFacts,
+    begun: tuple[int, int],
     shell: InProcessShell,
     frames: MemoryFrameStore,
     published: list[Message],
@@ -148,13 +177,9 @@ def _feed_flight(
     watch: Watch,
     progress: bool,
 ) -> None:
-    """Feeds the frames one after the other. Recording is outside the measured time: in flight it is another process."""
-    shell.feed(origin)
-    shell.feed(said)
-    output.take(published)
-    watch(published)
-    published.clear()
-    count, last_ns = 0, origin.t_ns
+    """Feeds the frames one after the other. ``begun``: number of frames before them, and time of the last [ns].
+    Recording is outside the measured time: in flight it is another process."""
+    count, last_ns = begun
     shots = source.shots()
     with _bar(progress, source.length()) as step:
         while True:

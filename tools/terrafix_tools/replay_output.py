@@ -98,17 +98,20 @@ class ReplayOutput:
             self._csv.flush()
 
     def copy_images(self, record: Path) -> None:
-        """Adds the images of another record of this flight."""
+        """Adds the images that another record of this flight has of its frames so far."""
         with self._writing():
             for frame_id, jpeg in read_thumbnails(record):
+                if frame_id not in self._table.rows:
+                    continue
                 self._record.write_thumbnail(self._time_ns(frame_id), frame_id, jpeg)
             for image in read_frame_images(record):
+                if image.frame_id not in self._table.rows:
+                    continue
                 t_ns = self._time_ns(image.frame_id)
                 self._record.write_frame_image(t_ns, image.frame_id, image.data, image.image_format)
 
     def _time_ns(self, frame_id: int) -> int:
-        row = self._table.rows.get(frame_id)
-        return round((row.t_s if row else 0.0) * NS)
+        return round(self._table.rows[frame_id].t_s * NS)
 
     def counts(self, cause: str = "") -> dict[str, Any]:
         """Returns frames, verdicts and times for summary.json. ``cause``: of a flight that found nothing, if something

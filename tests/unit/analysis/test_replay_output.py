@@ -4,7 +4,8 @@ import csv
 import errno
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -21,8 +22,10 @@ from terrafix.core.node import Node, NodeContext
 from terrafix.map.package import MapPackage
 from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images, read_thumbnails
 from terrafix.recorder.writer import FlightWriter
-from terrafix_tools.estimates import COLUMNS, read_rows
+from terrafix.vision.sources import Shot, Source, open_source
+from terrafix_tools.estimates import COLUMNS, ESTIMATES, read_rows
 from terrafix_tools.replay import replay
+from terrafix_tools.rerun.earlier import KEPT, EarlierPart, earlier_part
 from terrafix_tools.rerun.frames import RecordedFrames
 
 FRAMES = 6
@@ -299,3 +302,82 @@ def test_replay_of_recorded_frames_gives_the_messages_of_the_replay(folder: Path
     images = [list(read_frame_images(tmp_path / name)) for name in ("a", "b")]
     assert images[0] == images[1]
     assert summary["source"] == str(tmp_path / "a")
+
+
+class RunningSum:
+    """A stub estimator whose position is the sum of all heights that it has heard."""
+
+    def __init__(self) -> None:
+        self.heard: list[int] = []
+        self._sum_m = 0.0
+
+    def on(self, message: m.Message) -> Iterable[m.Message]:
+        if isinstance(message, m.VehicleState):
+            self._sum_m += message.agl_m or 0.0
+        elif isinstance(message, m.Odometry):
+            self.heard.append(message.frame_id)
+            yield estimate(message.frame_id, self._sum_m, 0.0)
+
+    def tick(self, now_ns: int) -> Iterable[m.Message]:
+        return ()
+
+
+class SeenFrames(StubVision):
+    def __init__(self, seen: list[int]) -> None:
+        self.seen = seen
+
+    def on(self, message: m.Message) -> Iterable[m.Message]:
+        if isinstance(message, m.Frame):
+            self.seen.append(message.frame_id)
+        return super().on(message)
+
+
+class From:
+    """A source without its frames before ``first``."""
+
+    def __init__(self, source: Source, first: int) -> None:
+        self._source, self._first = source, first
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._source, name)
+
+    def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
+        return (shot for shot in self._source.shots(from_s) if shot.frame.frame_id >= self._first)
+
+
+@pytest.mark.parametrize("again_at", [-1, 1])  # frame at which the second replay is ended, too; -1: it is not
+def test_a_replay_that_was_ended_goes_on_after_its_last_frame_to_the_same_record(
+    folder: Path, tmp_path: Path, again_at: int
+) -> None:
+    """The estimator has heard all frames once, vision those that the ended replay has not seen."""
+    out, killed_at, seen = tmp_path / "out", 3, list[int]()
+    replay(folder, None, tmp_path / "whole", nodes=lambda _: {"vision": StubVision(), "estimator": RunningSum()})
+
+    def run(earlier: EarlierPart | None, end_at: int) -> RunningSum:
+        estimator = RunningSum()
+        first = 0 if earlier is None else earlier.frames
+
+        def end(messages: list[m.Message]) -> None:
+            if any(isinstance(message, m.Frame) and message.frame_id == end_at for message in messages):
+                raise InterruptedError
+
+        def made(ctx: NodeContext) -> dict[str, Node]:
+            assert (ctx.epoch_ns is None) == (earlier is None)
+            return {"vision": SeenFrames(seen), "estimator": estimator}
+
+        with suppress(InterruptedError):
+            replay(From(open_source(str(folder)), first), None, out, nodes=made, watch=end, earlier=earlier)
+        return estimator
+
+    run(None, killed_at)  # after its messages are on the disk, before its results are stored
+    if again_at >= 0:
+        run(earlier_part(out, killed_at), again_at)  # before it has the whole record of the first one
+    seen.clear()
+    estimator = run(earlier_part(out, killed_at), -1)
+    assert estimator.heard == [*range(FRAMES)] and seen == [*range(killed_at, FRAMES)]
+    messages = [[message for _, _, message in read_flight(folder)] for folder in (tmp_path / "whole", out)]
+    assert messages[0] == messages[1]
+    assert [row.lat_deg for row in read_rows(out / ESTIMATES)] == [
+        row.lat_deg for row in read_rows(tmp_path / "whole" / ESTIMATES)
+    ]
+    assert len(list(read_thumbnails(out))) == FRAMES and not (out / KEPT).exists()

@@ -45,6 +45,7 @@ def test_names_of_events_are_those_of_the_contract() -> None:
     assert [name_of(kind) for kind in EVENTS] == [
         "frame_processed",
         "frame_refined",
+        "waypoints_updated",
         "search_expanded",
         "user_input_needed",
         "processing_blocked",
@@ -106,7 +107,6 @@ def test_a_step_that_is_computed_again_adds_nothing(database: Database) -> None:
     result = FrameResult(frame_id=0, file="a", t_s=0.0)
     outcome = FrameOutcome(
         result=result,
-        heading=(90.0, 2.0),
         fragment=Fragment(fragment_id=0, first_frame=0, last_frame=0, frames=1, joined=True),
         events=[blocked(1), blocked(2)],
         state=FlightState.BLOCKED,

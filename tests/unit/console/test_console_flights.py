@@ -16,6 +16,7 @@ from console_rig import Console, Served, Watched, settings
 from map_cluster import LocalCluster, local_cluster
 from terrafix_tools.console.client import ConsoleClient
 from terrafix_tools.console.payloads import NewFlight, ObjectPixel, PixelPoint, UserFix
+from terrafix_tools.mission.file import read_mission
 
 pytestmark = pytest.mark.slow  # processes, but no clock: the tests wait as long as it takes
 
@@ -82,15 +83,24 @@ def test_a_lost_flight_asks_goes_on_by_a_user_fix_and_is_refined_at_its_end(tmp_
         record = console.send("GET", f"/flights/{flight_id}/recordings/flight.mcap")
         assert record.body.startswith(b"\x89MCAP")
         refined = [r for r in client.results(flight_id, refined=True).results if r.refined]
+        track = tmp_path / "track.waypoints"
+        track.write_bytes(console.send("GET", f"/flights/{flight_id}/waypoints").body)
+        newest = [(r.gps.lat, r.gps.lon) for r in client.results(flight_id, refined=True).results if r.gps]
+        assert [(item.lat_deg, item.lon_deg) for item in read_mission(track).items] == newest
         assert len(refined) == statistics["refined"]
         applied = [event for event in watched.seen if event.name == "user_fix_applied"]
         assert applied or [e for e in watched.seen if e.data.get("measurement") == "user_fix"], "gated as a measurement"
 
 
 def stored(client: ConsoleClient, flight_id: str) -> list[Any]:
-    """Results, refined results, fragments and events of a completed flight."""
+    """Results, refined results, fragments and events of a completed flight, without the name of the flight."""
     events = [(event.name, event.data) for event in client.events(flight_id)]
     results = [client.results(flight_id, refined=refined).results for refined in (False, True)]
+    for named in [*results[0], *results[1]]:
+        assert named.frame_uid == f"{flight_id}/{named.frame_id}"
+        named.frame_uid = ""
+    for _, data in events:
+        assert data.pop("frame_uid", f"{flight_id}/{data.get('frame_id')}") == f"{flight_id}/{data.get('frame_id')}"
     return [results, client.flight(flight_id).fragments, events]
 
 
@@ -146,12 +156,24 @@ def killed_at(data: Path, maps: Path, flight: Undisturbed) -> Iterator[Any]:
     yield served.process.wait(timeout=60)
 
 
-def test_a_service_that_is_killed_goes_on_to_the_same_results_and_events(
+def test_a_service_that_is_killed_goes_on_at_the_image_where_it_was(
     tmp_path: Path, maps: Path, undisturbed: Undisturbed
 ) -> None:
-    after_kills, exit_code = killed_at(tmp_path, maps, undisturbed)
-    assert after_kills == undisturbed.expected
+    ((results, refined), fragments, events), exit_code = killed_at(tmp_path, maps, undisturbed)
+    (expected, _), _, _ = undisturbed.expected
     assert exit_code == 0
+    first, second = fragments  # odometry begins anew where the process has ended; nothing before is computed again
+    assert first.first_frame == 0 and first.last_frame + 1 == second.first_frame == second.fragment_id > 0
+    assert results[: second.first_frame] == expected[: second.first_frame]
+    assert len(results) == len(expected) and [r.frame_id for r in results] == [*range(len(FRAMES))]
+    for found, undisturbed_one in zip(results, expected, strict=True):
+        assert (
+            found.gps is not None
+            and distance_m((found.gps.lat, found.gps.lon), place_of(FRAMES[found.frame_id])) < 10.0
+        )
+        assert found.heading == pytest.approx(undisturbed_one.heading, abs=3.0) and found.heading_sigma < 10.0
+    assert {result.refined_by for result in refined} == {"finalised"}, "the record is that of the whole flight"
+    assert [data["frame_id"] for name, data in events if name == "frame_processed"] == [*range(len(FRAMES))]
 
 
 def computing(cluster: LocalCluster) -> list[int]:

@@ -23,6 +23,7 @@ from terrafix_tools.console.events import (
     UserFixApplied,
     UserInputNeeded,
     VerdictGiven,
+    WaypointsUpdated,
     name_of,
 )
 from terrafix_tools.console.payloads import FlightState, FragmentState
@@ -67,7 +68,7 @@ def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
     assert (result.match, result.inliers, result.source) == ("accepted", 12, "satellite_anchored")
     assert result.ellipse.semi_major_m == pytest.approx(4.0 * math.sqrt(5.991), abs=0.01)
     assert result.confidence == pytest.approx(1.0 - math.exp(-(20.0**2) / (2 * 4.0**2)), abs=1e-4)
-    assert outcome.heading == (90.0, pytest.approx(math.degrees(0.1)))
+    assert result.heading_sigma == pytest.approx(math.degrees(0.1), abs=1e-3)
     assert [name_of(type(e)) for e in outcome.events] == ["frame_processed", "fragment_changed"]
 
 
@@ -215,7 +216,7 @@ def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
 
 def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> None:
     flight = ObservedFlight()
-    flight.observer.hints[77] = 3
+    flight.observer.hints[77], flight.observer.flight_id = 3, "f7"
     flight.observer.take(
         [
             m.MeasurementVerdict(t_ns=0, frame_id=0, measurement="height", verdict=m.Verdict.IMPLAUSIBLE, detail="x"),
@@ -258,6 +259,9 @@ def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> 
     assert (refined.gps.lat, refined.source, refined.ellipse.bearing_deg) == (48.5, "smoother", 90.0)
     assert (refined.fragment_id, refined.m_per_unit, refined.orientation) == (3, 1.25, [1.0, 0.0, 0.0, 0.0])
     assert refined.covariance == [float(i) for i in range(36)]
+    assert of_kind(outcome, WaypointsUpdated) == [
+        WaypointsUpdated(frames=1, first_frame=0, last_frame=0, url="/flights/f7/waypoints")
+    ]
     assert flight.observer.rest().events == []
 
 

@@ -6,7 +6,8 @@ import pytest
 
 import tiny_onnx
 from terrafix_engines import manifest
-from terrafix_engines.manifest import ManifestError
+from terrafix_engines.manifest import ManifestError, Preset
+from terrafix_engines.providers import CPU, CUDA, TENSORRT, provider_chain, tensorrt_options
 from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import State, StoredModel, models_folder, resolve_model, stored_model
 
@@ -129,3 +130,12 @@ def test_a_stored_model_is_ready_absent_or_altered(tmp_path: Path) -> None:
     assert model.state() is State.ABSENT
     with pytest.raises(ModelFileError, match=r"tiny\.onnx: not there; terrafix models fetch tiny"):
         model.open(("input",), ("descriptors",))
+
+
+@pytest.mark.parametrize("provider", [CUDA, TENSORRT])
+def test_every_gpu_provider_is_told_a_share_of_the_six_gigabytes(provider: str) -> None:
+    chain = provider_chain(provider, tensorrt_options(Path("e"), Preset(sizes={}), ()))
+    stated = [link[1] for link in chain if not isinstance(link, str)]
+    limits = [int(options.get("gpu_mem_limit") or options["trt_max_workspace_size"]) for options in stated]
+    assert limits and all(0 < 4 * limit <= 6 * 2**30 for limit in limits)
+    assert chain[0][0] == provider and chain[-1] == CPU

@@ -130,9 +130,21 @@ def test_points_with_large_errors_count_less() -> None:
     assert hit(ground_patch(view(), DOWN, PointCloud(points, sigma_m), None), DOWN)[2] == pytest.approx(500.0, abs=0.05)
 
 
-@pytest.mark.parametrize("cloud", [around(0.0, 512.0, count=5), around(9.0, 512.0), around(40.0, 512.0)])
-def test_few_points_or_points_on_one_side_are_not_used(cloud: PointCloud) -> None:
+@pytest.mark.parametrize("cloud", [around(0.0, 512.0, count=5), around(40.0, 512.0)])
+def test_few_points_or_points_far_away_are_not_used(cloud: PointCloud) -> None:
     assert ground_patch(view(), DOWN, cloud, None).surface is Surface.PLANE
+
+
+def test_beside_the_points_the_ground_may_be_theirs_or_that_without_them() -> None:
+    """Points on a roof 12 m high, all on one side of the pixel."""
+    above, aside = (ground_patch(view(), DOWN, around(e_m, 512.0), None) for e_m in (0.0, 9.0))
+    assert above.surface is aside.surface is Surface.POINTS
+    assert above.sigma_m < 3.0 and 12.0 < aside.sigma_m < 13.0
+
+
+def test_points_aside_of_the_pixel_tell_less_by_the_error_of_the_slope() -> None:
+    aside = ground_patch(view(), DOWN, around(18.0, 500.0), None)
+    assert aside.sigma_m == pytest.approx(np.linalg.norm([1.2, 2.0, 0.03 * aside.at_m[0], 0.03 * 18.0]), rel=1e-3)
 
 
 @pytest.mark.parametrize("up", [0.5, 0.0, -0.04])

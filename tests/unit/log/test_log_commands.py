@@ -21,6 +21,8 @@ from terrafix.recorder.reader import ReadResult, read_flight, read_thumbnails
 from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.log.show import Selection, follow
+from terrafix_tools.mission.file import read_mission
+from terrafix_tools.mission.items import AltitudeFrame, Do
 
 FRAMES = 20
 LOCATED = FRAMES - 1  # the first frame has no position
@@ -189,6 +191,18 @@ def test_without_a_wall_clock_an_export_has_no_time(tmp_path: Path) -> None:
     assert "time_utc" not in parquet.read_table(tmp_path / "track.parquet").column_names
     call("export", tmp_path / "flight.mcap", tmp_path / "track.gpx")
     assert "<time>" not in (tmp_path / "track.gpx").read_text()
+
+
+def test_a_waypoint_file_has_the_newest_position_of_each_frame_at_its_height(tmp_path: Path) -> None:
+    pose = m.RefinedPose(frame_id=2, lat_deg=48.5, lon_deg=11.5, alt_amsl_m=612.0, sigma_e_m=1.0, sigma_n_m=1.0)
+    write_record(tmp_path / "flight.mcap", [*live_messages(FRAMES), m.Refinement(t_ns=0, poses=[pose])])
+    call("export", tmp_path / "flight.mcap", tmp_path / "track.waypoints")
+    mission = read_mission(tmp_path / "track.waypoints")
+    assert len(mission.items) == LOCATED and {item.do for item in mission.items} == {Do.WAYPOINT}
+    assert {item.altitude_frame for item in mission.items} == {AltitudeFrame.SEA}
+    first, second = mission.items[:2]
+    assert (second.lat_deg, second.lon_deg, second.height_m) == (48.5, 11.5, 612.0)
+    assert (first.lat_deg, first.lon_deg) == (mission.home_lat_deg, mission.home_lon_deg) != (48.5, 11.5)
 
 
 def test_a_flight_without_a_position_is_not_exported(tmp_path: Path) -> None:

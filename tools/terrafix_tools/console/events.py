@@ -41,6 +41,15 @@ class FrameRefined(OfFrame, CameraPose):
     fragment_id: int
 
 
+class WaypointsUpdated(Event):
+    """The positions of past frames have changed: ``url`` has the newest of all frames as a waypoint file."""
+
+    frames: int  # that have changed
+    first_frame: int  # of them
+    last_frame: int
+    url: str
+
+
 class SearchExpanded(OfFrame):
     """Lost: the search has reached another size. ``grid_size``: tiles, 1 to 25; None: the whole map."""
 
@@ -149,6 +158,7 @@ class Health(Event):
 EVENTS: tuple[type[Event], ...] = (
     FrameProcessed,
     FrameRefined,
+    WaypointsUpdated,
     SearchExpanded,
     UserInputNeeded,
     ProcessingBlocked,

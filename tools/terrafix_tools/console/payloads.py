@@ -285,6 +285,7 @@ class FrameResult(CameraPose):
     altitude: float | None = None  # m AMSL
     agl_m: float | None = None
     heading: float | None = None  # degrees, clockwise from true north
+    heading_sigma: float | None = None  # 1-sigma, degrees
     confidence: float | None = None
     ellipse: Ellipse | None = None
     source: str = ""  # "satellite_anchored", "visual_propagated", "dead_reckoned", "not_placed"

@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Header, Query, Request, Response
 from fastapi import Path as InPath
-from starlette.responses import FileResponse, RedirectResponse, StreamingResponse
+from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, StreamingResponse
 
 from terrafix import __version__
 from terrafix_tools.console.guard import COOKIE, token_of
@@ -33,6 +33,7 @@ from terrafix_tools.console.photo_facts import photo_facts
 from terrafix_tools.console.problems import Refusal
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.store import flights
+from terrafix_tools.mission.file import mission_text, track_mission
 
 MAX_PAGE = 1000  # results of one answer [spec: docs/console.md]
 PROBLEMS: dict[int | str, dict[str, Any]] = {
@@ -226,6 +227,20 @@ def results(
         found = flights.results_of(db, flight_id, refined=refined, first=first, most=limit + 1)
     more = found[limit].frame_id if len(found) > limit else None
     return Results(flight_id=flight_id, refined=refined, results=found[:limit], next_from=more)
+
+
+@router.get("/flights/{flight_id}/waypoints", response_class=PlainTextResponse)
+def waypoints(request: Request, flight_id: FlightId) -> PlainTextResponse:
+    """The newest position of each frame as a waypoint file (QGC WPL 110), for a ground station."""
+    with service_of(request).database.read() as db:
+        flights.row_of(db, flight_id)
+        found = flights.results_of(db, flight_id, refined=True, first=0, most=-1)
+    places = [(result.gps.lat, result.gps.lon, result.altitude) for result in found if result.gps is not None]
+    if not places:
+        raise Refusal(409, "no frame of this flight has a position yet")
+    name = f"{flight_id}.waypoints"
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return PlainTextResponse(mission_text(track_mission(name, places)), headers=headers)
 
 
 @router.post("/flights/{flight_id}/user-fix", status_code=202)

@@ -30,6 +30,7 @@ FORMATS = {
     "gpx": Format("one track", geographic.write_gpx, ".gpx"),
     "kml": Format("Google Earth: points, track, gx:Track", kml.write_kml, ".kml"),
     "kmz": Format("the same, packed", kml.write_kmz, ".kmz"),
+    "waypoints": Format("mission of a ground station (QGC WPL 110)", geographic.write_waypoints, ".waypoints"),
     "odm": Format("geo.txt of OpenDroneMap and WebODM", photogrammetry.write_odm, "geo.txt"),
     "pix4d": Format("CSV of Pix4D: omega, phi, kappa, accuracies", photogrammetry.write_pix4d),
     "metashape": Format("CSV of Metashape: the same", photogrammetry.write_metashape),

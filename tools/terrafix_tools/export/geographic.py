@@ -10,6 +10,7 @@ import numpy as np
 
 from terrafix_tools.estimates import COLUMNS, Row, cells
 from terrafix_tools.export.track import Track, TrackPose
+from terrafix_tools.mission.file import track_mission, write_mission
 
 WGS84 = "EPSG:4326"
 POINT_Z, LINE_Z = 1001, 1002  # ISO WKB geometry types
@@ -49,6 +50,11 @@ def write_csv(track: Track, out: Path, _photos: Path | None) -> None:
         writer.writerow([*COLUMNS, *more])
         for pose, values in zip(track.poses, zip(*more.values(), strict=True), strict=True):
             writer.writerow([*cells(pose.row), *("" if value is None else value for value in values)])
+
+
+def write_waypoints(track: Track, out: Path, _photos: Path | None) -> None:
+    places = [(pose.lat_deg, pose.lon_deg, pose.row.alt_amsl_m) for pose in track.poses]
+    write_mission(out, track_mission(track.name, places))
 
 
 def write_parquet(track: Track, out: Path, _photos: Path | None) -> None:

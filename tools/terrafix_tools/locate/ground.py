@@ -12,7 +12,9 @@ from terrafix_tools.locate.cloud import Elevation, PointCloud
 from terrafix_tools.locate.views import CameraView
 
 MIN_POINTS, MAX_POINTS = 6, 12  # that give the level about a pixel
-NEAR = 0.12  # radius about a pixel within which points count, normalised image coordinates: 7 degrees
+# Radius about a pixel within which points count, normalised image coordinates: 14 degrees. Beyond it the
+# level below the camera is as good. [measured: docs/records.md, village-1]
+NEAR = 0.25
 MAX_GAP_RAD = np.pi  # largest angle between neighbouring points about the pixel: beyond, all lie on one side
 MIN_SIGMA_SHARE = 0.1  # least sigma of a point, share of the median: none outweighs a hundred others
 MIN_DESCENT = 0.05  # least downward component of a unit ray: 3 degrees below the horizon
@@ -30,13 +32,16 @@ class Surface(StrEnum):
 @dataclass(frozen=True)
 class GroundPatch:
     """Tangent plane of the ground: height AMSL ``up_m`` at ``at_m`` (2,) with ``slope`` (2,), rise towards east and
-    north, and 1-sigma of the height of what the pixel shows."""
+    north, and 1-sigma of the height of what the pixel shows. ``level_sigma_m``: the part of it that all ground has in
+    common; ``slope_sigma``: 1-sigma of the slope of visible ground."""
 
     surface: Surface
     at_m: np.ndarray
     up_m: float
     slope: np.ndarray
     sigma_m: float
+    level_sigma_m: float = 0.0
+    slope_sigma: float = 0.0
 
     def heights_m(self, points_m: np.ndarray) -> np.ndarray:
         """AMSL heights (N,) of the plane at points (N, 2 or 3): east, north, ..."""
@@ -69,8 +74,9 @@ def _plane_patch(view: CameraView, ray: np.ndarray) -> GroundPatch:
     at_m = plane.intersect(view.p_c_in_w_m, ray)
     away_m = float(np.hypot(*(at_m - view.p_c_in_w_m)[HORIZONTAL]))
     slope_sigma, level_share = sigmas
-    sigma_m = float(np.linalg.norm([LEVEL_M, level_share * view.height_m, slope_sigma * away_m, relief_m]))
-    return GroundPatch(Surface.PLANE, at_m[HORIZONTAL], float(at_m[UP]), slope, sigma_m)
+    level_sigma_m = float(np.hypot(LEVEL_M, level_share * view.height_m))
+    sigma_m = float(np.linalg.norm([level_sigma_m, slope_sigma * away_m, relief_m]))
+    return GroundPatch(Surface.PLANE, at_m[HORIZONTAL], float(at_m[UP]), slope, sigma_m, level_sigma_m, slope_sigma)
 
 
 def _elevation_patch(view: CameraView, ray: np.ndarray, elevation: Elevation | None) -> GroundPatch | None:
@@ -97,26 +103,31 @@ def _elevation_patch(view: CameraView, ray: np.ndarray, elevation: Elevation | N
     if ray[UP] - slope @ ray[HORIZONTAL] > 0.5 * ray[UP]:  # an edge: the ray meets the ground at a flatter place
         slope = np.zeros(2)
     sigma_m = float(np.hypot(LEVEL_M, DEM_SIGMAS[1] * view.height_m))
-    return GroundPatch(Surface.ELEVATION, at_m[HORIZONTAL], float(at_m[UP]), slope, sigma_m)
+    return GroundPatch(Surface.ELEVATION, at_m[HORIZONTAL], float(at_m[UP]), slope, sigma_m, sigma_m, DEM_SIGMAS[0])
 
 
 def _cloud_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, reference: GroundPatch) -> GroundPatch | None:
     """Plane at the level of the points about the ray, with the slope of ``reference``, whose level the cloud has; None:
-    there are too few, or all lie on one side.
+    there are too few.
 
-    The height of what a pixel shows departs from that level as those of the points do: houses, trees, relief between
-    them."""
+    The height of what a pixel shows departs from that level as those of the points do (houses, trees, relief between
+    them), and by the error of the slope on the way to it from their middle. Where all lie on one side, the ground there
+    may as well be that of ``reference``."""
     x, y, z = view.r_w_c.T @ ray
     near, away = cloud.seen_near(view, np.array([x, y]) / z, NEAR, MAX_POINTS)
     count = len(away)
-    if count < MIN_POINTS or _largest_gap_rad(away) > MAX_GAP_RAD:
+    if count < MIN_POINTS:
         return None
     weight = 1.0 / np.square(np.maximum(near.sigma_m, MIN_SIGMA_SHARE * np.median(near.sigma_m)))
     weight /= weight.sum()
     above_m = near.points_m[:, UP] - reference.heights_m(near.points_m)
     mean_m = float(weight @ above_m)
     departure_m2 = float(weight @ np.square(above_m - mean_m)) * count / (count - 1)
-    sigma_m = float(np.sqrt(departure_m2 * (1.0 + weight @ weight) + reference.sigma_m**2))
+    from_middle_m = float(np.linalg.norm(weight @ near.points_m[:, HORIZONTAL] - reference.at_m))
+    departure_m = np.sqrt(departure_m2 * (1.0 + weight @ weight))
+    one_sided_m = mean_m if _largest_gap_rad(away) > MAX_GAP_RAD else 0.0
+    parts_m = [departure_m, reference.level_sigma_m, reference.slope_sigma * from_middle_m, one_sided_m]
+    sigma_m = float(np.linalg.norm(parts_m))
     return replace(reference, surface=Surface.POINTS, up_m=reference.up_m + mean_m, sigma_m=sigma_m)
 
 

@@ -65,6 +65,14 @@ def read_mission(path: Path, *, course_only: bool = False) -> Mission:
 
 def write_mission(path: Path, mission: Mission) -> None:
     """Writes a waypoint file for a ground station or an autopilot. Raises OutputError."""
+    try:
+        path.write_text(mission_text(mission), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another --out") from None
+
+
+def mission_text(mission: Mission) -> str:
+    """The waypoint file of a mission."""
     numbers = {do: number for number, do in COMMANDS.items()}
     frames = {AltitudeFrame.SEA: 0, AltitudeFrame.HOME: 3, AltitudeFrame.GROUND: 10}
     lines = [HEADER, _line(0, 1, 0, WAYPOINT, (0.0, 0.0, 0.0, 0.0), mission.home_lat_deg, mission.home_lon_deg, 0.0)]
@@ -72,10 +80,24 @@ def write_mission(path: Path, mission: Mission) -> None:
         amounts = (1.0, item.amount, -1.0, 0.0) if item.do is Do.SPEED else (item.amount, 0.0, item.radius_m, 0.0)
         place = item.lat_deg or 0.0, item.lon_deg or 0.0, item.height_m or 0.0
         lines.append(_line(i, 0, frames[item.altitude_frame], numbers[item.do], amounts, *place))
-    try:
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another --out") from None
+    return "\n".join(lines) + "\n"
+
+
+def track_mission(name: str, places: list[tuple[float, float, float | None]]) -> Mission:
+    """A waypoint at each place (latitude, longitude [degrees], height [m AMSL]; None: unknown, written as the height of
+    home), in their order. Home is the first one. Raises IndexError: there is none."""
+    items = tuple(
+        Item(
+            Do.WAYPOINT,
+            number,
+            lat_deg,
+            lon_deg,
+            amsl_m,
+            AltitudeFrame.HOME if amsl_m is None else AltitudeFrame.SEA,
+        )
+        for number, (lat_deg, lon_deg, amsl_m) in enumerate(places, start=1)
+    )
+    return Mission(name, *places[0][:2], items)
 
 
 def _line(i: int, current: int, frame: int, command: int, params: tuple[float, ...], *place: float) -> str:

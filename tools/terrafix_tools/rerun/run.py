@@ -87,7 +87,7 @@ def _examine(record: Path) -> tuple[ReadResult, bool]:
 def _recorded_order(record: Path, result: ReadResult) -> Iterator[tuple[Message, int | None]]:
     """-> the messages of the record without those of the estimator, each followed by itself as an input."""
     for _, _, message in _messages(record, result):
-        if not _is_output(message):
+        if not is_output(message):
             yield message, None
         if isinstance(message, PROCESS.subscribes):
             yield message, 0
@@ -97,7 +97,7 @@ def _input_order(record: Path, result: ReadResult, inputs: OrderedInputs) -> Ite
     """-> (message, None) for each message of the record without those of the estimator, and (message, began_ns) for
     each input at its turn."""
     for _, received_ns, message in _messages(record, result):
-        if not _is_output(message):
+        if not is_output(message):
             yield message, None
         if isinstance(message, PROCESS.subscribes):
             inputs.put(message, received_ns)
@@ -114,7 +114,7 @@ def _messages(record: Path, result: ReadResult) -> Iterator[tuple[int, int, Mess
         yield log_ns, received_ns, message
 
 
-def _is_output(message: Message) -> bool:
+def is_output(message: Message) -> bool:
     """Whether estimator or smoother have published ``message``. Their InputOrder stays: the replay follows it."""
     if isinstance(message, MeasurementVerdict):
         return message.measurement not in LINK_MEASUREMENTS

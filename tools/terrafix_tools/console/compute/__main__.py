@@ -1,8 +1,8 @@
 """python -m terrafix_tools.console.compute: one flight, from its first image to its completion or until it is ended.
 
-Deterministic: after a kill the next process computes the same again and stores only what is missing. It reports on
-standard output, a word a line: "frame N" (begins), "stored", "waiting", "done", "failed WHY". A line on its standard
-input wakes it; the end of the input ends it."""
+After a kill the next process goes on at the image where it was (rerun/earlier.py); on a cluster it computes the same
+again. It stores only what is missing. It reports on standard output, a word a line: "frame N" (begins), "stored",
+"waiting", "done", "failed WHY". A line on its standard input wakes it; the end of the input ends it."""
 
 import argparse
 import fcntl
@@ -33,6 +33,7 @@ from terrafix_tools.console.store.database import Database, open_database
 from terrafix_tools.finalised import read_poses
 from terrafix_tools.replay import replay
 from terrafix_tools.replay_output import SUMMARY
+from terrafix_tools.rerun.earlier import earlier_part
 
 PROGRESS_STEPS = 10  # events of a stage of finalise [spec: docs/console.md]
 
@@ -53,14 +54,18 @@ class FlightProcess:
         )
 
     def run(self) -> None:
-        """Raises TerrafixError."""
+        """Goes on after the frames that an earlier process has computed. Raises TerrafixError."""
+        out = self._folder / "out"
+        earlier = earlier_part(out, self._known)
+        self.source.first_frame = 0 if earlier is None else earlier.frames
         replay(
             self.source,
             self._options.map,
-            self._folder / "out",
+            out,
             configs=self._options.config,
             models=self._options.model,
             watch=self.take,
+            earlier=earlier,
         )
         self.complete()
 

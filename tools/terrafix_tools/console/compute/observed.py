@@ -43,6 +43,7 @@ from terrafix_tools.console.events import (
     UserFixApplied,
     UserInputNeeded,
     VerdictGiven,
+    WaypointsUpdated,
 )
 from terrafix_tools.console.payloads import (
     Ellipse,
@@ -67,7 +68,6 @@ class FrameOutcome:
     """What one step of a flight adds. ``result``: None at the origin and at the end."""
 
     result: FrameResult | None = None
-    heading: tuple[float, float] | None = None  # and its 1-sigma, degrees
     fragment: Fragment | None = None
     refined: list[FrameRefined] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
@@ -163,8 +163,6 @@ class FlightObserver:
             self._totals.radii_m.append(result.ellipse.semi_major_m)
         outcome = self._outcome(events)
         outcome.result, outcome.fragment = result, fragment
-        if estimate is not None and result.heading is not None:
-            outcome.heading = result.heading, math.degrees(math.sqrt(max(estimate.cov[35], 0.0)))
         return outcome
 
     @property
@@ -211,6 +209,11 @@ class FlightObserver:
 
     def _outcome(self, events: list[Event]) -> FrameOutcome:
         events = [*events, *self._others, *self._refined]
+        if self._refined:
+            changed = [refined.frame_id for refined in self._refined]
+            span = {"first_frame": min(changed), "last_frame": max(changed)}
+            url = f"/flights/{self.flight_id}/waypoints"
+            events.append(WaypointsUpdated(frames=len({*changed}), url=url, **span))
         for event in events:
             if isinstance(event, (OfFrame, ProcessingBlocked)) and event.frame_id is not None:
                 event.file = self._file_of.get(event.frame_id, "")
@@ -357,6 +360,7 @@ def _result(shown: Frame, estimate: NavEstimate | None, found: MapMatch | None, 
         result.altitude = None if estimate.amsl_m is None else round(estimate.amsl_m, 3)
         result.agl_m = round(estimate.agl_m, 3)
         result.heading = round(yaw_deg_of(estimate), 3)
+        result.heading_sigma = round(math.degrees(math.sqrt(max(estimate.cov[35], 0.0))), 3)
         result.source = str(estimate.source_label)
         result.fragment_id, result.joined = estimate.fragment_id, estimate.joined
     return result

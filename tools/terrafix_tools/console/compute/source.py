@@ -57,6 +57,7 @@ class UploadedImages:
     ) -> None:
         self._database, self._flight_id, self._folder = database, flight_id, folder
         self._wait, self._begins, self._steer = wait, begins, steer
+        self.first_frame = 0  # those before were computed by an earlier process
         with database.read() as db:
             self.new = NewFlight.model_validate_json(flights.row_of(db, flight_id).spec)
             states = [self._state(image) for image in flights.images_of(db, flight_id, 0, 1)]
@@ -87,7 +88,7 @@ class UploadedImages:
 
     def uploads(self) -> Iterator[Upload]:
         """The images in their order, unread."""
-        frame_id = 0
+        frame_id = self.first_frame
         while True:
             with self._database.read() as db:
                 page = flights.images_of(db, self._flight_id, frame_id, PAGE)

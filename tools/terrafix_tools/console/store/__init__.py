@@ -1,1 +1,1 @@
-"""What the console keeps: flights, images, results, fragments, headings, hints and events, in one SQLite file."""
+"""What the console keeps: flights, images, results, fragments, hints and events, in one SQLite file."""

@@ -32,7 +32,7 @@ from terrafix_tools.console.payloads import (
     WholeVerdict,
 )
 from terrafix_tools.console.problems import Refusal
-from terrafix_tools.console.store.schema import events, flights, fragments, headings, hints, images, results
+from terrafix_tools.console.store.schema import events, flights, fragments, hints, images, results
 
 EVENT_PAGE = 500  # events that are read at once [spec: about 200 kB]
 REFINED_KEYS = ("gps", "altitude", "ellipse", "orientation", "covariance", "m_per_unit")  # of a result
@@ -318,11 +318,6 @@ def store_outcome(db: sa.Connection, flight_id: str, step: str, outcome: FrameOu
     """Everything that one step of a flight adds. ``step``: its name, once in a flight."""
     if outcome.result is not None:
         _put(db, results, flight_id, frame_id=outcome.result.frame_id, immediate=outcome.result.model_dump_json())
-        if outcome.heading is not None:
-            heading_deg, sigma_deg = outcome.heading
-            _put(
-                db, headings, flight_id, frame_id=outcome.result.frame_id, heading_deg=heading_deg, sigma_deg=sigma_deg
-            )
     if outcome.fragment is not None:
         _put(db, fragments, flight_id, **outcome.fragment.model_dump())
     for refined in outcome.refined:

@@ -50,14 +50,6 @@ results = sa.Table(
     sa.Column("immediate", sa.Text, nullable=False),  # JSON: FrameResult
     sa.Column("refined", sa.Text),  # JSON: FrameRefined, the newest
 )
-headings = sa.Table(
-    "headings",
-    metadata,
-    _of_flight(),
-    sa.Column("frame_id", sa.Integer, primary_key=True),
-    sa.Column("heading_deg", sa.Float, nullable=False),
-    sa.Column("sigma_deg", sa.Float, nullable=False),
-)
 fragments = sa.Table(
     "fragments",
     metadata,

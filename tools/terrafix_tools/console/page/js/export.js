@@ -2,7 +2,7 @@
 
 import {ellipseRing} from "./geo.js";
 
-const COLUMNS = ["frame_id", "file", "t_s", "lat", "lon", "altitude", "agl_m", "heading", "confidence", "semi_major_m", "semi_minor_m",
+const COLUMNS = ["frame_id", "frame_uid", "file", "t_s", "lat", "lon", "altitude", "agl_m", "heading", "heading_sigma", "confidence", "semi_major_m", "semi_minor_m",
   "bearing_deg", "source", "match", "inliers", "search", "fragment_id", "joined", "refined",
   "refined_by", "qw", "qx", "qy", "qz", "covariance", "m_per_unit", "error"];
 
