@@ -91,15 +91,11 @@ FALSE_INPUTS = (
     ),
     Fault("mirrored pictures", "Left and right are exchanged in every picture.", source=shown(pictures.mirrored)),
     Fault(
-        "roll and pitch swapped",
-        "Roll is reported as pitch, and pitch as roll.",
-        telemetry=reported(edits.roll_pitch_swapped),
-    ),
+        "roll and pitch swapped", "Roll is reported as pitch, and pitch as roll.",
+        telemetry=reported(edits.roll_pitch_swapped)),
     Fault(
-        "roll and pitch negated",
-        "Roll and pitch are reported with the wrong sign.",
-        telemetry=reported(edits.roll_pitch_negated),
-    ),
+        "roll and pitch negated", "Roll and pitch are reported with the wrong sign.",
+        telemetry=reported(edits.roll_pitch_negated)),
     *(Fault(name, words, telemetry=reported(edits.height_times(factor))) for name, words, factor in HEIGHTS),
     *(
         Fault(
@@ -110,140 +106,86 @@ FALSE_INPUTS = (
         for word, factor in (("halved", 0.5), ("doubled", 2.0))
     ),
     Fault(
-        "frozen picture with noise",
-        "The camera repeats one picture for 15 s, with new noise each time.",
-        FROZEN_S,
-        partial(pictures.stale_buffers, buffers=1),
-    ),
+        "frozen picture with noise", "The camera repeats one picture for 15 s, with new noise each time.", FROZEN_S,
+        partial(pictures.stale_buffers, buffers=1)),
     Fault(
-        "four stale buffers",
-        "The camera repeats four pictures in turn for 15 s.",
-        FROZEN_S,
-        partial(pictures.stale_buffers, buffers=BUFFERS),
-    ),
+        "four stale buffers", "The camera repeats four pictures in turn for 15 s.", FROZEN_S,
+        partial(pictures.stale_buffers, buffers=BUFFERS)),
     Fault(
-        "camera falls behind",
-        "For 15 s the pictures play at half their speed, then the camera is live.",
-        FROZEN_S,
-        partial(pictures.falling_behind, lag_s=FROZEN_S / 2),
-    ),
+        "camera falls behind", "For 15 s the pictures play at half their speed, then the camera is live.", FROZEN_S,
+        partial(pictures.falling_behind, lag_s=FROZEN_S / 2)),
     Fault(
-        "stream falls behind",
-        "For 40 s the delay of the pictures grows evenly to 2 s, then the camera is live.",
-        40.0,
-        partial(pictures.falling_behind, lag_s=2.0),
-    ),
+        "stream falls behind", "For 40 s the delay of the pictures grows evenly to 2 s, then the camera is live.",
+        40.0, partial(pictures.falling_behind, lag_s=2.0)),
     Fault(
         "picture squeezed in one axis",
         "16:9 is shown as 4:3 in every picture: one axis has another scale than the description says.",
-        source=shown(pictures.scaled(1.0, 4.0 / 3.0)),
-    ),
+        source=shown(pictures.scaled(1.0, 4.0 / 3.0))),
     Fault(
-        "camera upside down",
-        "For 20 s the pictures are turned by 180 degrees, as after a reboot of the camera.",
-        20.0,
-        shown(pictures.upside_down),
-    ),
+        "camera upside down", "For 20 s the pictures are turned by 180 degrees, as after a reboot of the camera.",
+        20.0, shown(pictures.upside_down)),
     Fault(
         "foreign frames in a row",
-        "For 5 s the pictures are mirrored: they agree with each other, and are nowhere on the map.",
-        5.0,
-        shown(pictures.mirrored),
-    ),
+        "For 5 s the pictures are mirrored: they agree with each other, and are nowhere on the map.", 5.0,
+        shown(pictures.mirrored)),
     Fault(
         "half the picture stands still",
         "The lower half of every picture shows a part of the vehicle, from the first frame on.",
-        source=whole(pictures.partly_frozen(STILL_SHARE, SEED)),
-        needs=PIXELS,
-    ),
+        source=whole(pictures.partly_frozen(STILL_SHARE, SEED)), needs=PIXELS),
     Fault(
-        "telemetry 2 s late",
-        "All that the autopilot reports is two seconds old when it gets its time.",
-        telemetry=whole(edits.late_telemetry(LATE_TELEMETRY_S)),
-    ),
+        "telemetry 2 s late", "All that the autopilot reports is two seconds old when it gets its time.",
+        telemetry=whole(edits.late_telemetry(LATE_TELEMETRY_S))),
     Fault(
-        "pictures 1 s late",
-        "Every picture is a second old when it gets its time.",
-        source=whole(pictures.late_pictures(LATE_S)),
-    ),
+        "pictures 1 s late", "Every picture is a second old when it gets its time.",
+        source=whole(pictures.late_pictures(LATE_S))),
     Fault(
-        "forged tilt",
-        "For 10 s a roll is reported that is 15 degrees more than the true one.",
-        FORGED_S,
-        telemetry=reported(edits.rolled(15.0)),
-    ),
+        "forged tilt", "For 10 s a roll is reported that is 15 degrees more than the true one.", FORGED_S,
+        telemetry=reported(edits.rolled(15.0))),
     Fault(
-        "forged heading",
-        "For 10 s the reported heading jumps by 90 degrees.",
-        FORGED_S,
-        telemetry=reported(edits.turned(90.0)),
-    ),
-)
+        "forged heading", "For 10 s the reported heading jumps by 90 degrees.", FORGED_S,
+        telemetry=reported(edits.turned(90.0))),
+)  # fmt: skip
 # True inputs, of which some are missing or imprecise: the position must stay good.
 SCARCE_INPUTS = (
     Fault(
-        "dropped and doubled frames",
-        "15 % of the frames are missing, 15 % come twice.",
-        source=whole(edits.dropped_and_doubled(DROPPED, DOUBLED, SEED)),
-        is_true=True,
-    ),
+        "dropped and doubled frames", "15 % of the frames are missing, 15 % come twice.",
+        source=whole(edits.dropped_and_doubled(DROPPED, DOUBLED, SEED)), is_true=True),
     Fault(
-        "height unknown",
-        "No height is reported.",
-        telemetry=reported(edits.height_unknown),
-        needs=UNKNOWN,
-        is_true=True,
-    ),
+        "height unknown", "No height is reported.", telemetry=reported(edits.height_unknown), needs=UNKNOWN,
+        is_true=True),
     Fault(
-        "start unknown", "No start is known.", origin=edits.start_unknown, needs=frozenset({Need.SEARCH}), is_true=True
-    ),
-)
+        "start unknown", "No start is known.", origin=edits.start_unknown, needs=frozenset({Need.SEARCH}),
+        is_true=True),
+)  # fmt: skip
 # Within what is promised.
 IMPRECISE_INPUTS = (
     Fault(
-        "height wrong by 10 %",
-        "The reported height is 10 % too large.",
-        telemetry=reported(edits.height_times(1.10)),
-        is_true=True,
-    ),
+        "height wrong by 10 %", "The reported height is 10 % too large.", telemetry=reported(edits.height_times(1.10)),
+        is_true=True),
     Fault(
-        "compass wrong by 15 degrees",
-        "The reported heading is off by 15 degrees.",
-        telemetry=reported(edits.turned(15.0)),
-        is_true=True,
-    ),
+        "compass wrong by 15 degrees", "The reported heading is off by 15 degrees.",
+        telemetry=reported(edits.turned(15.0)), is_true=True),
     Fault(
-        "heading unknown", "No heading is reported.", telemetry=reported(edits.yaw_unknown), needs=UNKNOWN, is_true=True
-    ),
-)
+        "heading unknown", "No heading is reported.", telemetry=reported(edits.yaw_unknown), needs=UNKNOWN,
+        is_true=True),
+)  # fmt: skip
 MATCHES = (
     Fault(
-        "350 m outlier fix",
-        "Every tenth map fix has an error of 350 m and a small covariance: it is rejected.",
-        matches=outliers,
-    ),
-)
-STREAMED = (  # as a stream or its receiver fails in flight
+        "350 m outlier fix", "Every tenth map fix has an error of 350 m and a small covariance: it is rejected.",
+        matches=outliers),
+)  # fmt: skip
+# As a stream or its receiver fails in flight.
+STREAMED = (
     Fault(
-        "pictures 1.4 s late at once",
-        "For 20 s every picture is 1.4 s old when it gets its time.",
-        20.0,
-        lambda span: during(span, pictures.late_pictures(1.4)),
-    ),
+        "pictures 1.4 s late at once", "For 20 s every picture is 1.4 s old when it gets its time.", 20.0,
+        lambda span: during(span, pictures.late_pictures(1.4))),
     Fault(
-        "frozen picture that jitters",
-        "The camera repeats one picture for 15 s, each time moved by 0.4 px.",
-        FROZEN_S,
-        pictures.jittering,
-        needs=PIXELS,
-    ),
+        "frozen picture that jitters", "The camera repeats one picture for 15 s, each time moved by 0.4 px.", FROZEN_S,
+        pictures.jittering, needs=PIXELS),
     Fault(
-        "zoom that creeps",
-        "For 20 s the focal length grows to 1.3 times that of the description.",
-        20.0,
-        partial(pictures.zooming, factor=1.3),
-    ),
-)
+        "zoom that creeps", "For 20 s the focal length grows to 1.3 times that of the description.", 20.0,
+        partial(pictures.zooming, factor=1.3)),
+)  # fmt: skip
 INPUTS = {fault.name: fault for fault in (*CAMERA, *FALSE_INPUTS)}
 SCENARIOS: tuple[Fault, ...] = (  # of several faults
     in_turn(
