@@ -1,7 +1,7 @@
 """Vision and estimator over a flight folder, without an anchor: a flight over ground that no map shows."""
 
 import csv
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,18 +9,20 @@ import numpy as np
 
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.node import Image, Node
+from terrafix.core.node import Image
 from terrafix.estimator.node import EstimatorNode
 from terrafix.messages import (
+    Imu,
     MeasurementVerdict,
     Message,
     NavEstimate,
     Odometry,
+    Origin,
     Relocalization,
+    VehicleState,
 )
 from terrafix.vision.node import VisionNode
 from terrafix.vision.sources import Shot, open_source
-from terrafix_tools.in_process import InProcessShell
 
 Alter = Callable[[Shot], Shot | None]  # -> the shot to fly with; None: it is left out
 
@@ -72,11 +74,15 @@ def fly(
     origin, store = source.origin(), MemoryFrameStore()
     truth = {row["file"]: (float(row["lat_deg"]), float(row["lon_deg"])) for row in _rows(folder / "truth.csv")}
     flown = MaplessFlight(LocalFrame(origin.lat_deg, origin.lon_deg))
-    nodes: dict[str, Node] = {"vision": VisionNode(store)}
-    if estimate:
-        nodes["estimator"] = EstimatorNode() if relocalize else WithoutRelocalization()
-    shell = InProcessShell(nodes, lambda _, message: flown.published.append(message))
-    shell.feed(origin)
+    vision, estimator = VisionNode(store), EstimatorNode()
+
+    def deliver(message: Message) -> None:
+        flown.published.append(message)
+        if not estimate or (isinstance(message, Relocalization) and not relocalize):
+            return
+        flown.published += estimator.on(message)
+
+    _both(origin, vision, deliver)
     for shot in source.shots(0.0):
         altered = alter(shot)
         if altered is None:
@@ -87,14 +93,9 @@ def fly(
         if altered.image is not None:
             store.put(frame.frame_id, altered.image)
         for message in (*(altered.imu if imu else ()), *altered.states, frame):
-            shell.feed(message)
+            _both(message, vision, deliver)
     source.close()
     return flown
-
-
-class WithoutRelocalization(EstimatorNode):
-    def on(self, message: Message) -> Iterable[Message]:
-        return () if isinstance(message, Relocalization) else super().on(message)
 
 
 def darkened(shot: Shot) -> Shot:
@@ -102,6 +103,13 @@ def darkened(shot: Shot) -> Shot:
     assert shot.image is not None
     image: Image = np.zeros_like(shot.image)
     return Shot(shot.frame, shot.states, image, shot.imu)
+
+
+def _both(message: Message, vision: VisionNode, deliver: Callable[[Message], None]) -> None:
+    if isinstance(message, (VehicleState, Imu, Origin)):
+        deliver(message)
+    for reply in vision.on(message):
+        deliver(reply)
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
