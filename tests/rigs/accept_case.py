@@ -16,7 +16,6 @@ from terrafix.messages import (
     MapMatch,
     MeasurementVerdict,
     Message,
-    NavEstimate,
     Odometry,
     Origin,
     Prediction,
@@ -30,6 +29,7 @@ from terrafix.recorder.provenance import header
 from terrafix.recorder.writer import FlightWriter
 from terrafix_lab.accept.measuring.evidence import Evidence, gather
 from terrafix_lab.accept.measuring.results import Marks
+from terrafix_lab.sim.true_messages import estimate as true_estimate
 from terrafix_tools.estimates import ESTIMATES, RowTable, write_rows
 from terrafix_tools.evaluate import Truth
 
@@ -126,10 +126,9 @@ def _frame(i: int, case: FrameCase) -> list[Message]:
             agl_m=100.0, agl_sigma_m=2.0, step_m=(0.0, STEP_M), step_cov_m2=(1.0, 0.0, 0.0, 1.0)),
         MapMatch(t_ns=t_ns, frame_id=i, verdict=match_verdict, matcher="gradient"),
         MeasurementVerdict(t_ns=t_ns, frame_id=i, measurement="map", verdict=match_verdict),
-        NavEstimate(
-            t_ns=t_ns - round(case.late_s * 1e9), frame_id=i, lat_deg=lat_deg, lon_deg=lon_deg,
-            alt_amsl_m=100.0, agl_m=100.0,
-            velocity_enu_mps=(0.0, 20.0, 0.0), velocity_sigma_mps=1.0, q_w_b=(1.0, 0.0, 0.0, 0.0), cov=cov,
+        true_estimate(
+            t_ns - round(case.late_s * 1e9), lat_deg, lon_deg, sigmas=(case.sigma_m,) * 3, frame_id=i,
+            alt_amsl_m=100.0, agl_m=100.0, velocity_enu_mps=(0.0, 20.0, 0.0), velocity_sigma_mps=1.0,
             source_label=case.label, covariance_mode=case.mode, last_anchor_age_ms=case.anchor_age_ms,
             emitted_at_ns=t_ns),
     ]  # fmt: skip

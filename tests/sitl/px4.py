@@ -31,6 +31,7 @@ from terrafix.core.geodesy import quat_from_rot, rot_w_b
 from terrafix.link.edge import open_edge
 from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.node import LinkNode
+from terrafix_tools.in_process import InProcessShell
 
 BINARY_VARIABLE = "TERRAFIX_PX4_SITL"
 HOME = (48.0, 11.0, 500.0)
@@ -129,7 +130,8 @@ class Px4Flight:
 
     def __init__(self, ports: Ports, outputs: tuple[str, ...] = (), seed: int = 1) -> None:
         section = {"device": f"udpin:127.0.0.1:{ports.companion}", "outputs": list(outputs)}
-        self.edge, self.node = open_edge(msgspec.convert(section, LinkSection)), LinkNode(10.0)
+        self.edge = open_edge(msgspec.convert(section, LinkSection))
+        self.shell = InProcessShell({"link": LinkNode(10.0)}, self._take, edges={"link": self.edge})
         self._sent_to = ("127.0.0.1", ports.ground)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
@@ -151,7 +153,7 @@ class Px4Flight:
         camera = m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0)
         sigmas = {"start_sigma_m": 5.0, "yaw_sigma_deg": 5.0, "agl_sigma_m": 5.0, "attitude_sigma_deg": 2.0}
         lat, lon, amsl = HOME
-        self.edge.on_message(m.Origin(t_ns=0, camera=camera, lat_deg=lat, lon_deg=lon, ground_amsl_m=amsl, **sigmas))
+        self.shell.feed(m.Origin(t_ns=0, camera=camera, lat_deg=lat, lon_deg=lon, ground_amsl_m=amsl, **sigmas))
 
     @property
     def s(self) -> float:
@@ -251,25 +253,20 @@ class Px4Flight:
                 number = getattr(mavlink, f"MAVLINK_MSG_ID_{kind}")
                 self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(number), 1e6 / hz)
         self._receive(now_ns)
-        for message in self.edge.poll(now_ns):
-            self.published.append(message)
-            self._publish(self.node.on(message))
+        self.shell.poll(now_ns)
         if not self.errors.silent and self._truths and self._is_due("estimate", 0.4):
             estimate = self._estimate(now_ns)
             if estimate is not None:
-                self._publish(self.node.on(estimate))
-        if self._is_due("tick", 0.02):
-            self._publish(self.node.tick(now_ns))
+                self.shell.feed(estimate)
+        self.shell.tick(now_ns)
         time.sleep(0.002)
 
-    def _publish(self, messages: Any) -> None:
-        for message in messages:
-            self.published.append(message)
-            self.edge.on_message(message)
-            truth = self.truth()
-            if isinstance(message, m.GpsInput) and truth:
-                sent = apart_m((message.lat_deg, message.lon_deg), truth) if message.fix_type >= 3 else math.nan
-                self.errors_m.append((self.s, self.error_m(), sent))
+    def _take(self, _publisher: str, message: m.Message) -> None:
+        self.published.append(message)
+        truth = self.truth()
+        if isinstance(message, m.GpsInput) and truth:
+            sent = apart_m((message.lat_deg, message.lon_deg), truth) if message.fix_type >= 3 else math.nan
+            self.errors_m.append((self.s, self.error_m(), sent))
 
     def _receive(self, now_ns: int) -> None:
         with contextlib.suppress(BlockingIOError):

@@ -20,6 +20,8 @@ from terrafix.link.node import LinkNode
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.sitl.firmware import BINARY_VARIABLE
 from terrafix_lab.sim.sitl.setup import write_parameters
+from terrafix_lab.sim.true_messages import estimate
+from terrafix_tools.in_process import InProcessShell
 
 _SETTING = os.environ.get(BINARY_VARIABLE, "")
 # The variable may name the plane's binary; the copter's is in the same folder.
@@ -66,23 +68,16 @@ def copter(
 
 def stationary_estimate(t_ns: int, place: tuple[float, float, float]) -> m.NavEstimate:
     """Estimate of a stationary, level vehicle. ``place``: latitude, longitude [deg], AMSL [m]; 4 m 1-sigma per axis."""
-    cov = [0.0] * 36
-    cov[0] = cov[7] = cov[14] = 16.0
-    return m.NavEstimate(
-        t_ns=t_ns,
+    lat_deg, lon_deg, amsl_m = place
+    return estimate(
+        t_ns,
+        lat_deg,
+        lon_deg,
+        sigmas=(4.0, 4.0, 0.0),
         frame_id=t_ns,
-        lat_deg=place[0],
-        lon_deg=place[1],
-        alt_amsl_m=place[2],
+        alt_amsl_m=amsl_m,
         agl_m=1.0,
-        velocity_enu_mps=(0.0, 0.0, 0.0),
         velocity_sigma_mps=0.4,
-        q_w_b=(1.0, 0.0, 0.0, 0.0),
-        cov=tuple(cov),
-        source_label=m.SourceLabel.SATELLITE_ANCHORED,
-        covariance_mode=m.CovarianceMode.MARGINALS,
-        last_anchor_age_ms=0,
-        emitted_at_ns=t_ns,
     )
 
 
@@ -116,27 +111,25 @@ def run_link(
 ) -> ReceivedMessages:
     """Runs the real edge and node with estimates of a vehicle that is stationary at ``place`` (latitude, longitude
     [deg], AMSL [m]), at 2.5 Hz, until ``is_done`` or for WAIT_S. -> what was received."""
-    edge, node = open_edge(config), LinkNode(10.0, config.gnss)
+    edge = open_edge(config)
     received = ReceivedMessages(edge)
+
+    def take(_publisher: str, message: m.Message) -> None:
+        received.hints += [message] if isinstance(message, m.PositionHint) else []
+
+    shell = InProcessShell({"link": LinkNode(10.0, config.gnss)}, take, edges={"link": edge})
     camera = m.Camera(width=1, height=1, fx=1, fy=1, cx=0, cy=0)
     sigmas = {"start_sigma_m": 5.0, "yaw_sigma_deg": 5.0, "agl_sigma_m": 5.0, "attitude_sigma_deg": 2.0}
-    edge.on_message(m.Origin(t_ns=0, camera=camera, lat_deg=HOME[0], lon_deg=HOME[1], ground_amsl_m=HOME[2], **sigmas))
-    began_s, next_estimate_ns, next_tick_ns = time.monotonic(), 0, 0
+    shell.feed(m.Origin(t_ns=0, camera=camera, lat_deg=HOME[0], lon_deg=HOME[1], ground_amsl_m=HOME[2], **sigmas))
+    began_s, next_estimate_ns = time.monotonic(), 0
     try:
         while time.monotonic() - began_s < WAIT_S and not is_done(received):
             now_ns = time.monotonic_ns()
-            for message in edge.poll(now_ns):
-                received.hints += [message] if isinstance(message, m.PositionHint) else []
-                for published in node.on(message):
-                    edge.on_message(published)
+            shell.poll(now_ns)
             if now_ns >= next_estimate_ns:
                 next_estimate_ns = now_ns + 400_000_000
-                for published in node.on(stationary_estimate(now_ns, place)):
-                    edge.on_message(published)
-            if now_ns >= next_tick_ns:
-                next_tick_ns = now_ns + 20_000_000
-                for published in node.tick(now_ns):
-                    edge.on_message(published)
+                shell.feed(stationary_estimate(now_ns, place))
+            shell.tick(now_ns)
             time.sleep(0.002)
     finally:
         edge.close()

@@ -17,18 +17,19 @@ from terrafix.link.edge import open_edge
 from terrafix.link.mavlink.transport import Address
 from terrafix.link.node import LinkNode
 from terrafix.messages import GpsInput, Message, NavEstimate
+from terrafix_tools.in_process import InProcessShell
 
-ESTIMATE_NS, TICK_NS = 400_000_000, 20_000_000
+ESTIMATE_NS = 400_000_000
 SIM_STATE_INTERVAL_US = 50_000.0
 REQUEST_NS = 500_000_000  # SIM_STATE is requested at this period until it arrives
 
 
 def main(port: str) -> None:
-    edge, node = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}")), LinkNode(10.0)
+    edge = open_edge(LinkSection(device=f"udpin:127.0.0.1:{port}"))
     process_packet = edge._on_packet
     newest: list[NavEstimate] = []  # at most one: from the newest SIM_STATE
-    is_first_fix = True
-    due_ns = {"request": 0, "estimate": 0, "tick": 0}
+    fixed: list[GpsInput] = []  # the first with a 3D fix
+    due_ns = {"request": 0, "estimate": 0}
 
     def record_packet(message: Any, sender: Address | None, now_ns: int) -> Iterator[Message]:
         if message.get_type() == "SIM_STATE":
@@ -44,26 +45,24 @@ def main(port: str) -> None:
         due_ns[task] = now_ns + period_ns
         return True
 
+    def report_first_fix(_publisher: str, message: Message) -> None:
+        if not fixed and isinstance(message, GpsInput) and message.fix_type == 3:
+            fixed.append(message)
+            sys.stdout.write(f"fix {time.monotonic()} {time.process_time()}\n")
+            sys.stdout.flush()
+
     edge._on_packet = record_packet  # type: ignore[method-assign]
+    shell = InProcessShell({"link": LinkNode(10.0)}, report_first_fix, edges={"link": edge})
     while True:
         now_ns = time.monotonic_ns()
-        for message in edge.poll(now_ns):
-            for published in node.on(message):
-                edge.on_message(published)
+        shell.poll(now_ns)
         if not newest and is_due("request", now_ns, REQUEST_NS):
             command, unused = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (0.0,) * 5
             params = float(mavlink.MAVLINK_MSG_ID_SIM_STATE), SIM_STATE_INTERVAL_US
             edge._send(mavlink.MAVLink_command_long_message(1, 1, command, 0, *params, *unused))
         if newest and is_due("estimate", now_ns, ESTIMATE_NS):
-            for published in node.on(newest[0]):
-                edge.on_message(published)
-        if is_due("tick", now_ns, TICK_NS):
-            for published in node.tick(now_ns):
-                edge.on_message(published)
-                if is_first_fix and isinstance(published, GpsInput) and published.fix_type == 3:
-                    is_first_fix = False
-                    sys.stdout.write(f"fix {time.monotonic()} {time.process_time()}\n")
-                    sys.stdout.flush()
+            shell.feed(newest[0])
+        shell.tick(now_ns)
         time.sleep(0.002)
 
 

@@ -18,6 +18,7 @@ from terrafix.core.config import Config, Map, SourceSection
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
 from terrafix.recorder.provenance import RECORD_FORMAT
 from terrafix.recorder.writer import FlightWriter
+from terrafix_lab.sim.true_messages import estimate as true_estimate
 
 NS = 1_000_000_000
 FIRST_DAY_NS = 1_767_261_600 * NS  # 2026-01-01 10:00 UTC
@@ -105,23 +106,18 @@ class Invented:
 def _estimate(
     i: int, t_ns: int, lat_deg: float, lon_deg: float, agl_m: float, heading: float, age_s: float
 ) -> m.NavEstimate:
-    variance_m2 = (2.0 + agl_m / 100 + 0.4 * age_s) ** 2
-    cov = np.diag([variance_m2, variance_m2, 9.0, 0.01, 0.01, 0.01])
-    return m.NavEstimate(
-        t_ns=t_ns,
+    return true_estimate(
+        t_ns,
+        lat_deg,
+        lon_deg,
+        sigmas=(2.0 + agl_m / 100 + 0.4 * age_s, 3.0, 0.1),
         frame_id=i,
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
         alt_amsl_m=500.0 + agl_m,
         agl_m=agl_m,
         velocity_enu_mps=(SPEED_MPS * math.cos(heading), SPEED_MPS * math.sin(heading), 0.0),
-        velocity_sigma_mps=0.5,
         q_w_b=quat_from_rot(rot_w_b(math.pi / 2 - heading, 0.0, 0.0)),
-        cov=tuple(cov.ravel().tolist()),
         source_label=m.SourceLabel.SATELLITE_ANCHORED if age_s < 1.5 else m.SourceLabel.VISUAL_PROPAGATED,
-        covariance_mode=m.CovarianceMode.MARGINALS,
         last_anchor_age_ms=round(1000 * age_s),
-        emitted_at_ns=t_ns,
     )
 
 

@@ -12,6 +12,7 @@ from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_w_b
 from terrafix.recorder.images import thumbnail_jpeg
 from terrafix.recorder.provenance import header
 from terrafix.recorder.writer import FlightWriter
+from terrafix_lab.sim.true_messages import estimate as true_estimate
 
 ORIGIN = LocalFrame(48.0, 11.0)
 PERIOD_NS = 500_000_000
@@ -28,20 +29,18 @@ def frame(i: int, file: str = "") -> m.Frame:
 
 def estimate(i: int, e_m: float, n_m: float, *, sigma_m: float = SIGMA_M, age_ms: int = 0) -> m.NavEstimate:
     lat_deg, lon_deg = ORIGIN.to_wgs84(e_m, n_m)
-    cov = np.diag([sigma_m**2, sigma_m**2, 9.0, 0.01, 0.01, 0.01])
-    return m.NavEstimate(
-        t_ns=i * PERIOD_NS,
+    return true_estimate(
+        i * PERIOD_NS,
+        lat_deg,
+        lon_deg,
+        sigmas=(sigma_m, 3.0, 0.1),
         frame_id=i,
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
         alt_amsl_m=600.0,
         agl_m=100.0,
         velocity_enu_mps=(10.0, 0.0, 0.0),
         velocity_sigma_mps=1.0,
         q_w_b=quat_from_rot(rot_w_b(math.radians(90.0), 0.0, 0.0)),
-        cov=tuple(cov.ravel().tolist()),
         source_label=m.SourceLabel.SATELLITE_ANCHORED if age_ms == 0 else m.SourceLabel.VISUAL_PROPAGATED,
-        covariance_mode=m.CovarianceMode.MARGINALS,
         last_anchor_age_ms=age_ms,
         emitted_at_ns=i * PERIOD_NS + 120_000_000,
     )

@@ -23,18 +23,18 @@ from terrafix.messages import (
     Odometry,
     ThermalBand,
     VehicleState,
-    Verdict,
 )
-from terrafix_lab.montecarlo.flown import imu_of
-from terrafix_lab.sim.interfaces import Readings, State
+from terrafix_lab.sim.flights.path import STEP_S
+from terrafix_lab.sim.interfaces import State
 from terrafix_lab.sim.sensors.suite import VehicleSensors
-from terrafix_lab.sim.true_messages import first_odometry, map_match, seen_from
+from terrafix_lab.sim.true_messages import first_odometry, map_match, odometry, vehicle_state
+from terrafix_lab.sim.true_messages import flown as sent_by
 from terrafix_lab.sim.vehicle.plane import Plane
 from terrafix_lab.sim.vehicle.wind import Wind
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.items import Box
 
-STEP_S, FRAME_EVERY, STATE_EVERY, BATCH = 0.02, 50, 2, 3
+FRAME_EVERY, STATE_EVERY, BATCH = 50, 2, 3
 FIX_EVERY = 4
 ORIGIN = msgspec.structs.replace(STEADY_ORIGIN, yaw_sigma_deg=3.0, agl_sigma_m=3.0, attitude_sigma_deg=0.7)
 
@@ -57,7 +57,6 @@ class InertialFlight:
         rng = np.random.default_rng([seed, 78])
         mission = course(seed, 40.0 * seconds, Box(-1500.0, -1500.0, 1500.0, 1500.0), PLACE, agl_m=120.0)
         plane = Plane(mission, PLACE, lambda e, n: 0.0, wind=Wind(5.4, 1.0), seed=seed)
-        sensors = VehicleSensors(PLACE, seed=seed)
         tilt = np.radians(rng.normal(0.0, CAMERA.mount_tolerance_deg / 2, 2))
         mount = Mount.of(CAMERA).r_b_c() @ exp_so3(np.array([*tilt, 0.0]))
         start = plane.state.p_b_in_w_m[:2] + rng.normal(0.0, ORIGIN.start_sigma_m, 2)
@@ -67,30 +66,19 @@ class InertialFlight:
         states: list[State] = []
         self.messages_by_frame: list[list[Message]] = []
         telemetry: list[Message] = []
-        batch: list[Readings] = []
-        for i in range(round(seconds / STEP_S)):
-            state = plane.step(STEP_S, None) if i else plane.state
-            readings, t_ns = sensors.read(state), round(state.t_s * 1e9)
-            if i % STATE_EVERY == 0:
-                telemetry.append(
-                    VehicleState(
-                        t_ns=t_ns,
-                        source="simulated",
-                        yaw_rad=readings.yaw_rad,
-                        pitch_rad=readings.pitch_rad,
-                        roll_rad=readings.roll_rad,
-                        agl_m=readings.baro_amsl_m,
-                        armed=True,
-                        airspeed_mps=readings.airspeed_mps,
-                    )
-                )
-            batch.append(readings)
-            if len(batch) == BATCH:
-                telemetry.append(imu_of(batch, "simulated"))
-                batch = []
+        steps = sent_by(
+            plane,
+            VehicleSensors(PLACE, seed=seed),
+            round(seconds / STEP_S),
+            vehicle_state,
+            state_every=STATE_EVERY,
+            imu_batch=BATCH,
+        )
+        for i, (state, sent) in enumerate(steps):
+            telemetry += sent
             states.append(state)
             if i % frame_every == 0:
-                shown = states[max(0, i - round(delay(state.t_s) / STEP_S))]
+                shown, t_ns = states[max(0, i - round(delay(state.t_s) / STEP_S))], round(state.t_s * 1e9)
                 self.poses.append((shown.r_w_b() @ mount, shown.p_b_in_w_m - np.array([*start, 0.0])))
                 self.true_m.append(state.p_b_in_w_m - np.array([*start, 0.0]))
                 self.velocity_mps.append(state.velocity_enu_mps)
@@ -110,15 +98,8 @@ class InertialFlight:
         self, i: int, keyframe: int, t_ns: int, rng: np.random.Generator, *, becomes_keyframe: bool
     ) -> Odometry:
         """Odometry of frame ``i`` against the frame ``keyframe``."""
-        return Odometry(
-            t_ns=t_ns,
-            frame_id=i,
-            keyframe_id=keyframe,
-            verdict=Verdict.ACCEPTED,
-            becomes_keyframe=becomes_keyframe,
-            fragment_id=0,
-            **seen_from(self.poses[keyframe], self.poses[i], rng),
-        )
+        poses = self.poses[keyframe], self.poses[i]
+        return odometry(t_ns, (keyframe, i), poses, rng, becomes_keyframe=becomes_keyframe)
 
     def fix(self, i: int, t_ns: int, rng: np.random.Generator) -> MapMatch:
         return map_match(t_ns, i, self.poses[i], rng, ground=plane(0.0))

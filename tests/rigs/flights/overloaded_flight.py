@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from inertial_flight import ORIGIN, STEP_S, InertialFlight
+from inertial_flight import ORIGIN, InertialFlight
 from simulated_flight import CAMERA, PLACE, EstimatorRun
 from terrafix.core.limits import MAX_KEYFRAME_AGE, MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.messages import MapMatch, MeasurementVerdict, Message, NavEstimate, Odometry, Verdict
 from terrafix.vision.feature_tracker import KEYFRAME_SHIFT
+from terrafix_lab.sim.flights.path import STEP_S
 from terrafix_lab.sim.true_messages import first_odometry
 
 FRAME_EVERY = 10  # steps: 5 frames a second

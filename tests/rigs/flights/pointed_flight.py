@@ -9,6 +9,7 @@ from flight_records import ORIGIN, PERIOD_NS, write_record
 from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
+from terrafix_lab.sim.true_messages import estimate as true_estimate
 
 CAMERA = m.Camera(width=800, height=600, fx=500.0, fy=500.0, cx=399.5, cy=299.5, focal_sigma=0.01)
 START_AMSL_M = 500.0
@@ -60,22 +61,17 @@ def pixel(i: int, point_m: np.ndarray) -> tuple[float, float]:
 
 def estimate(i: int, fragment_id: int = 0) -> m.NavEstimate:
     lat_deg, lon_deg = ORIGIN.to_wgs84(*camera_m(i)[:2].tolist())
-    cov = np.diag([SIGMA_M**2, SIGMA_M**2, SIGMA_M**2, *[TILT_SIGMA_RAD**2] * 3])
-    return m.NavEstimate(
-        t_ns=i * PERIOD_NS,
+    return true_estimate(
+        i * PERIOD_NS,
+        lat_deg,
+        lon_deg,
+        sigmas=(SIGMA_M, SIGMA_M, TILT_SIGMA_RAD),
         frame_id=i,
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
         alt_amsl_m=START_AMSL_M + AGL_M,
         agl_m=AGL_M,
         velocity_enu_mps=(40.0, 0.0, 0.0),
         velocity_sigma_mps=1.0,
         q_w_b=quat_from_rot(rot_w_b(YAW_RAD, 0.0, 0.0)),
-        cov=tuple(cov.ravel().tolist()),
-        source_label=m.SourceLabel.SATELLITE_ANCHORED,
-        covariance_mode=m.CovarianceMode.MARGINALS,
-        last_anchor_age_ms=0,
-        emitted_at_ns=i * PERIOD_NS,
         fragment_id=fragment_id,
     )
 

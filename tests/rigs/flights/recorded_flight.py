@@ -1,6 +1,6 @@
 """Records and flight graphs of a simulated flight with altered messages, for the tests of the post-flight smoother."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
@@ -8,18 +8,12 @@ import numpy as np
 
 from flight_records import write_record
 from map_matches import pose_of, with_pose
-from simulated_flight import PLACE, Flight, blind, t_ns
+from simulated_flight import PLACE, Alter, Flight, blind, t_ns, unaltered
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.messages import Frame, MapMatch, Message, Odometry, Relocalization, Verdict
 from terrafix_lab.sim.true_messages import seen_from
 from terrafix_tools.finalise.batch_smoother import Smoothed
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
-
-Alter = Callable[[Message], Message | None]  # -> the message to use; None: it is left out
-
-
-def unaltered(message: Message) -> Message | None:
-    return message
 
 
 def messages(flight: Flight, alter: Alter = unaltered) -> Iterable[Message]:

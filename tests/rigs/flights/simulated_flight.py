@@ -4,7 +4,7 @@ The ground is flat at height zero, or has hills that the map does not contain. E
 distribution that its message states."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,7 +26,8 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
-from terrafix_lab.sim.true_messages import Pose, features, first_odometry, map_match, seen_from
+from terrafix_lab.sim.true_messages import Pose, features, first_odometry, map_match, odometry
+from terrafix_lab.sim.vehicle.level import level_path
 
 FRAME_S = 0.5
 SPEED_MPS = 12.0
@@ -76,9 +77,7 @@ class Flight:
         heading = 0.5 + np.cumsum(0.10 * np.sin(t_s / 11.0)) * FRAME_S
         heading += self.turn_rad * np.clip((t_s - 15.0) / 2.0, 0.0, 1.0)
         speed_mps = self.speed_mps * np.where(self.stop_and_go & (t_s % 20.0 >= 10.0), 0.05, 1.0)
-        steps = speed_mps[:, None] * FRAME_S * np.column_stack([np.sin(heading), np.cos(heading)])
-        start = rng.normal(0.0, ORIGIN.start_sigma_m, 2)
-        xy = start + np.vstack([np.zeros(2), np.cumsum(steps[:-1], axis=0)])
+        xy = level_path(heading, speed_mps * FRAME_S, rng.normal(0.0, ORIGIN.start_sigma_m, 2))
         path_m = np.arange(self.frames) * self.speed_mps * FRAME_S
         ground = math.sqrt(2.0) * self.hills_m * (np.cos(path_m / 160.0 + self.seed) - math.cos(self.seed))
         up = 100.0 + self.climb_amplitude_m * np.sin(t_s / 17.0) + ground  # terrain following
@@ -141,15 +140,28 @@ class Flight:
         if i == 0:
             return first_odometry(0)
         keyframe = keyframe_of(i)
-        return Odometry(
-            t_ns=t_ns(i),
-            frame_id=i,
-            keyframe_id=keyframe,
-            verdict=Verdict.ACCEPTED,
-            becomes_keyframe=i % KEYFRAME_EVERY == 0,
-            fragment_id=0,
-            **seen_from(self.pose_over(keyframe, keyframe), self.pose_over(i, keyframe), self.rng_of),
-        )
+        poses = self.pose_over(keyframe, keyframe), self.pose_over(i, keyframe)
+        return odometry(t_ns(i), (keyframe, i), poses, self.rng_of, becomes_keyframe=i % KEYFRAME_EVERY == 0)
+
+
+Alter = Callable[[Message], Message | None]  # -> the message to use; None: it is left out
+
+
+def altered(messages: Iterable[Message], alter: Alter) -> list[Message]:
+    return [used for message in messages if (used := alter(message)) is not None]
+
+
+def unaltered(message: Message) -> Message | None:
+    return message
+
+
+def without_fix(message: Message) -> Message | None:
+    return None if isinstance(message, MapMatch) else message
+
+
+def without_sight(message: Message) -> Message | None:
+    """Neither map matches nor tracked features."""
+    return blind(message) if isinstance(message, Odometry) else without_fix(message)
 
 
 class EstimatorRun:
@@ -165,12 +177,14 @@ class EstimatorRun:
         self.published += published
         return published
 
-    def fly(self, flight: Flight, first: int, end: int) -> "EstimatorRun":
-        """Feeds the frames first .. end - 1, after the Origin if ``first`` is 0."""
+    def fly(
+        self, flight: Flight, first: int, end: int, alter: "Alter | None" = None, origin: Origin = ORIGIN
+    ) -> "EstimatorRun":
+        """Feeds the frames first .. end - 1, altered, after ``origin`` if ``first`` is 0."""
         if first == 0:
-            self.feed([ORIGIN])
+            self.feed([origin])
         for i in range(first, end):
-            self.feed(flight.messages(i))
+            self.feed(altered(flight.messages(i), alter or unaltered))
         return self
 
     def estimates(self) -> list[NavEstimate]:
@@ -192,8 +206,7 @@ def same_features(flight: Flight, keyframe: int, i: int, features: np.ndarray) -
     """Odometry of frame i against ``keyframe`` with the same ``features`` (N, 2; normalised coordinates in the
     keyframe) for every frame."""
     poses = flight.pose_over(keyframe, keyframe), flight.pose_over(i, keyframe)
-    seen = seen_from(*poses, np.random.default_rng([i, 3]), features)
-    return Odometry(t_ns=t_ns(i), frame_id=i, keyframe_id=keyframe, verdict=Verdict.ACCEPTED, **seen)
+    return odometry(t_ns(i), (keyframe, i), poses, np.random.default_rng([i, 3]), xy=features)
 
 
 def some_features() -> np.ndarray:

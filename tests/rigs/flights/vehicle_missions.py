@@ -1,15 +1,16 @@
 """Rig of the tests of simulated vehicles and sensors: a place, missions there, and their simulation."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
+from terrafix_lab.sim.flights.path import STEP_S, states_of
 from terrafix_lab.sim.interfaces import Navigation, State, Vehicle, navigation_of
 from terrafix_tools.mission.items import AltitudeFrame, Do, Item, Mission
 
 PLACE = LocalFrame(48.0, 11.0)
-STEP_S = 0.02
 HOME = (100.0, -50.0)  # east, north
 
 
@@ -40,24 +41,17 @@ def mission(*items: Item) -> Mission:
     return Mission("test", *PLACE.to_wgs84(*HOME), items)
 
 
-def fly(vehicle: Vehicle, first: State, seconds: float, offset_m: np.ndarray | None = None) -> list[State]:
-    """-> the states of all steps, with the first one. ``offset_m``: (3,) error of the position that the vehicle's
+def fly(vehicle: Vehicle, seconds: float, offset_m: np.ndarray | None = None) -> list[State]:
+    """-> the states of all steps, with that of now. ``offset_m``: (3,) error of the position that the vehicle's
     controller gets; None: it gets the true state."""
-    states = [first]
-    for _ in range(round(seconds / STEP_S)):
-        navigation: Navigation | None = None
-        if offset_m is not None:
-            navigation = navigation_of(states[-1])
-            navigation = Navigation(
-                navigation.p_b_in_w_m + offset_m,
-                navigation.velocity_enu_mps,
-                navigation.yaw_rad,
-                navigation.pitch_rad,
-                navigation.roll_rad,
-                navigation.airspeed_mps,
-            )
-        states.append(vehicle.step(STEP_S, navigation))
-    return states
+
+    def navigation(state: State) -> Navigation | None:
+        if offset_m is None:
+            return None
+        true = navigation_of(state)
+        return replace(true, p_b_in_w_m=true.p_b_in_w_m + offset_m)
+
+    return list(states_of(vehicle, round(seconds / STEP_S) + 1, navigation))
 
 
 def positions(states: list[State]) -> np.ndarray:

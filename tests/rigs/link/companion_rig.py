@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from autopilot_rig import FRAME, Rig
-from link_rig import S, estimate
+from link_rig import LinkRun, S, estimate
 from link_wire import MemoryWire
 from terrafix import messages as m
 from terrafix.core.config import Config, LinkSection
@@ -56,7 +56,7 @@ class Companion:
     def start(self, link: LinkSection) -> None:
         self.edge = MavlinkEdge(link, RigWire(self.rig), lambda: 0, previous_source=PreviousSourceFile(self.folder))
         context = NodeContext(Config(link=link), MemoryFrameStore(), None, self.folder, state_dir=self.folder)
-        self.node = make_node(context)
+        self.run = LinkRun(make_node(context), self.edge)
 
     def fly(
         self,
@@ -69,13 +69,12 @@ class Companion:
         while self.rig.t_s < until_s and not until():
             self.rig.fly(STEP_S)
             now_ns = round(self.rig.t_s * S)
-            messages = list(self.edge.poll(now_ns))
+            self.run.shell.poll(now_ns)
             if round(self.rig.t_s / STEP_S) % ESTIMATES_EVERY == 0 and (sigma := sigma_m(self.rig.t_s)) is not None:
-                messages.append(self._estimate(now_ns, sigma))
-            answers = [answer for message in messages for answer in self.node.on(message)]
-            for answer in [*answers, *self.node.tick(now_ns)]:
-                self.published.append(answer)
-                self.edge.on_message(answer)
+                self.run.feed([self._estimate(now_ns, sigma)])
+            self.run.shell.tick(now_ns)
+            self.published += self.run.published
+            self.run.published.clear()
 
     def _estimate(self, now_ns: int, sigma_m: float) -> m.NavEstimate:
         lat, lon = FRAME.to_wgs84(*self.rig.truth(self.rig.t_s)[:2])

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from link_rig import LAT, LON, MS, SPEED_EAST, S, estimate
+from link_rig import LAT, LON, MS, SPEED_EAST, TICK_NS, S, estimate, fly
 from terrafix import messages as m
 from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.node import LinkNode
@@ -37,15 +37,16 @@ def feed_receiver(
 ) -> list[m.Message]:
     """-> messages of a link that gets readings at 5 Hz with the error ``where``, and estimates at 2 Hz with the error
     ``ours`` [m east]."""
-    published: list[m.Message] = []
-    for step in range(round(begin_s * 50), round((begin_s + seconds) * 50)):
-        now_ns, t_s = step * 20 * MS, step * 0.02
+
+    def feed(now_ns: int) -> list[m.Message]:
+        step, t_s, arrived = now_ns // TICK_NS, now_ns / S, list[m.Message]()
         if step % 25 == 5:
-            published += node.on(estimate(now_ns - 100 * MS, east_m=ours(t_s), **claims))
+            arrived.append(estimate(now_ns - 100 * MS, east_m=ours(t_s), **claims))
         if step % 10 == 0:
-            published += node.on(reading(now_ns, where(t_s)))
-        published += node.tick(now_ns)
-    return published
+            arrived.append(reading(now_ns, where(t_s)))
+        return arrived
+
+    return fly(node, round(begin_s * S), round((begin_s + seconds) * S), feed)
 
 
 def accurate(_: float) -> tuple[float, float]:

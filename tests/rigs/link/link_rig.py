@@ -3,18 +3,23 @@
 import gc
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from terrafix import messages as m
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.node import LinkNode
+from terrafix.processes import PROCESSES, SOURCE
+from terrafix_lab.sim.true_messages import estimate as true_estimate
+from terrafix_tools.in_process import InProcessShell
 
 LAT, LON, ALT = 48.0, 11.0, 620.0
 SPEED_EAST = 20.0
 S = 1_000_000_000
 MS = 1_000_000
 TICK_NS = 20 * MS
+(LINK,) = (process for process in PROCESSES if process.name == "link")
 
 
 def covariance(sigma_m: float, vertical_m: float = 3.0) -> tuple[float, ...]:
@@ -33,41 +38,56 @@ def estimate(
     late_ns: int = 100 * MS,
     anchor_age_ms: int = 0,
     velocity_sigma: float = 0.5,
-    **changes: object,
+    **changes: Any,
 ) -> m.NavEstimate:
     """Estimate of a vehicle that flies east at 20 m/s through LAT, LON at t = 0. ``east_m``: error to the east."""
     lat, lon = offset(LAT, LON, SPEED_EAST * t_ns / S + east_m, 0.0)
-    fields: dict[str, object] = dict(
-        t_ns=t_ns,
-        frame_id=t_ns // MS,
-        lat_deg=lat,
-        lon_deg=lon,
-        alt_amsl_m=ALT,
-        agl_m=120.0,
-        velocity_enu_mps=(SPEED_EAST, 0.0, 0.0),
-        velocity_sigma_mps=velocity_sigma,
-        q_w_b=(1.0, 0.0, 0.0, 0.0),
-        cov=covariance(sigma_m),
-        source_label=m.SourceLabel.SATELLITE_ANCHORED,
-        covariance_mode=m.CovarianceMode.MARGINALS,
-        last_anchor_age_ms=anchor_age_ms,
-        emitted_at_ns=t_ns + late_ns,
-    )
-    return m.NavEstimate(**(fields | changes))  # type: ignore[arg-type]
+    fields: dict[str, Any] = {
+        "lat_deg": lat,
+        "lon_deg": lon,
+        "alt_amsl_m": ALT,
+        "velocity_enu_mps": (SPEED_EAST, 0.0, 0.0),
+        "velocity_sigma_mps": velocity_sigma,
+        "cov": covariance(sigma_m),
+        "last_anchor_age_ms": anchor_age_ms,
+        "emitted_at_ns": t_ns + late_ns,
+    }
+    return true_estimate(t_ns, sigmas=(sigma_m, 3.0, 0.01), **fields | changes)
 
 
 Feed = Callable[[int], list[m.Message]]
 
 
-def fly(node: LinkNode, start_ns: int, end_ns: int, feed: Feed, step_ns: int = TICK_NS) -> list[m.Message]:
+class LinkRun:
+    """A link node, and its edge if it has one, in the driver of one process (``shell``). ``published``: by the node;
+    with an edge also what it has read, and what was fed."""
+
+    def __init__(self, node: LinkNode, edge: MavlinkEdge | None = None) -> None:
+        self.published: list[m.Message] = []
+        edges = {} if edge is None else {"link": edge}
+
+        def take(publisher: str, message: m.Message) -> None:
+            self.published += [message] if edges or publisher != SOURCE else []
+
+        self.shell = InProcessShell({"link": node}, take, edges=edges)
+
+    def feed(self, messages: Iterable[m.Message]) -> None:
+        """As the bus delivers them; what the bus does not bring to the link as its edge reads it."""
+        for message in messages:
+            if isinstance(message, LINK.subscribes):
+                self.shell.feed(message)
+            else:
+                self.shell.feed_read("link", message)
+
+
+def fly(node: LinkNode, start_ns: int, end_ns: int, feed: Feed) -> list[m.Message]:
     """Ticks the node at 50 Hz in simulated time. ``feed(now_ns)``: messages that arrive before a tick. -> all published
     messages."""
-    published: list[m.Message] = []
-    for now_ns in range(start_ns, end_ns, step_ns):
-        for message in feed(now_ns):
-            published += node.on(message)
-        published += node.tick(now_ns)
-    return published
+    run = LinkRun(node)
+    for now_ns in range(start_ns, end_ns, TICK_NS):
+        run.feed(feed(now_ns))
+        run.shell.tick(now_ns)
+    return run.published
 
 
 def every(period_ns: int, make: Callable[[int], m.Message], late_ns: int = 100 * MS) -> Feed:
@@ -97,24 +117,10 @@ def east_error_m(sent: m.GpsInput) -> float:
 def live(node: LinkNode, edge: MavlinkEdge, seconds: float, feed: Feed = lambda _: []) -> list[m.Message]:
     """Runs the loop of the live shell in real time with the real edge. -> all published and received messages."""
     gc.freeze()  # as the shell does: a collection of the objects of all earlier tests takes 150 ms
-    published: list[m.Message] = []
-    until_ns = time.monotonic_ns() + round(seconds * S)
-    next_tick_ns = 0
+    run, until_ns = LinkRun(node, edge), time.monotonic_ns() + round(seconds * S)
     while (now_ns := time.monotonic_ns()) < until_ns:
-        for message in feed(now_ns):
-            published += _pass_to_edge(edge, list(node.on(message)))
-        for message in edge.poll(now_ns):
-            published.append(message)
-            published += _pass_to_edge(edge, list(node.on(message)))
-        if now_ns >= next_tick_ns:
-            next_tick_ns = now_ns - now_ns % TICK_NS + TICK_NS
-            published += _pass_to_edge(edge, list(node.tick(now_ns)))
+        run.feed(feed(now_ns))
+        run.shell.step(now_ns)
         time.sleep(0.001)
     gc.unfreeze()
-    return published
-
-
-def _pass_to_edge(edge: MavlinkEdge, messages: list[m.Message]) -> list[m.Message]:
-    for message in messages:
-        edge.on_message(message)
-    return messages
+    return run.published

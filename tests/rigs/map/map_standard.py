@@ -15,109 +15,42 @@ import cv2
 import numpy as np
 
 TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z")
-COLUMNS = {  # table -> column: (type, NOT NULL, part of the primary key); 12-128r18 annex C, 17-066r1 clause 7
-    "gpkg_spatial_ref_sys": {
-        "srs_name": ("TEXT", 1, 0),
-        "srs_id": ("INTEGER", 1, 1),
-        "organization": ("TEXT", 1, 0),
-        "organization_coordsys_id": ("INTEGER", 1, 0),
-        "definition": ("TEXT", 1, 0),
-        "description": ("TEXT", 0, 0),
-        "definition_12_063": ("TEXT", 1, 0),
-    },
-    "gpkg_contents": {
-        "table_name": ("TEXT", 1, 1),
-        "data_type": ("TEXT", 1, 0),
-        "identifier": ("TEXT", 0, 0),
-        "description": ("TEXT", 0, 0),
-        "last_change": ("DATETIME", 1, 0),
-        "min_x": ("DOUBLE", 0, 0),
-        "min_y": ("DOUBLE", 0, 0),
-        "max_x": ("DOUBLE", 0, 0),
-        "max_y": ("DOUBLE", 0, 0),
-        "srs_id": ("INTEGER", 0, 0),
-    },
-    "gpkg_extensions": {
-        "table_name": ("TEXT", 0, 0),
-        "column_name": ("TEXT", 0, 0),
-        "extension_name": ("TEXT", 1, 0),
-        "definition": ("TEXT", 1, 0),
-        "scope": ("TEXT", 1, 0),
-    },
-    "gpkg_tile_matrix_set": {
-        "table_name": ("TEXT", 1, 1),
-        "srs_id": ("INTEGER", 1, 0),
-        "min_x": ("DOUBLE", 1, 0),
-        "min_y": ("DOUBLE", 1, 0),
-        "max_x": ("DOUBLE", 1, 0),
-        "max_y": ("DOUBLE", 1, 0),
-    },
-    "gpkg_tile_matrix": {
-        "table_name": ("TEXT", 1, 1),
-        "zoom_level": ("INTEGER", 1, 1),
-        "matrix_width": ("INTEGER", 1, 0),
-        "matrix_height": ("INTEGER", 1, 0),
-        "tile_width": ("INTEGER", 1, 0),
-        "tile_height": ("INTEGER", 1, 0),
-        "pixel_x_size": ("DOUBLE", 1, 0),
-        "pixel_y_size": ("DOUBLE", 1, 0),
-    },
-    "gpkg_geometry_columns": {
-        "table_name": ("TEXT", 1, 1),
-        "column_name": ("TEXT", 1, 1),
-        "geometry_type_name": ("TEXT", 1, 0),
-        "srs_id": ("INTEGER", 1, 0),
-        "z": ("TINYINT", 1, 0),
-        "m": ("TINYINT", 1, 0),
-    },
-    "gpkg_metadata": {
-        "id": ("INTEGER", 1, 1),
-        "md_scope": ("TEXT", 1, 0),
-        "md_standard_uri": ("TEXT", 1, 0),
-        "mime_type": ("TEXT", 1, 0),
-        "metadata": ("TEXT", 1, 0),
-    },
-    "gpkg_metadata_reference": {
-        "reference_scope": ("TEXT", 1, 0),
-        "table_name": ("TEXT", 0, 0),
-        "column_name": ("TEXT", 0, 0),
-        "row_id_value": ("INTEGER", 0, 0),
-        "timestamp": ("DATETIME", 1, 0),
-        "md_file_id": ("INTEGER", 1, 0),
-        "md_parent_id": ("INTEGER", 0, 0),
-    },
-    "gpkg_2d_gridded_coverage_ancillary": {
-        "id": ("INTEGER", 1, 1),
-        "tile_matrix_set_name": ("TEXT", 1, 0),
-        "datatype": ("TEXT", 1, 0),
-        "scale": ("REAL", 1, 0),
-        "offset": ("REAL", 1, 0),
-        "precision": ("REAL", 0, 0),
-        "data_null": ("REAL", 0, 0),
-        "grid_cell_encoding": ("TEXT", 0, 0),
-        "uom": ("TEXT", 0, 0),
-        "field_name": ("TEXT", 0, 0),
-        "quantity_definition": ("TEXT", 0, 0),
-    },
-    "gpkg_2d_gridded_tile_ancillary": {
-        "id": ("INTEGER", 1, 1),
-        "tpudt_name": ("TEXT", 1, 0),
-        "tpudt_id": ("INTEGER", 1, 0),
-        "scale": ("REAL", 1, 0),
-        "offset": ("REAL", 1, 0),
-        "min": ("REAL", 0, 0),
-        "max": ("REAL", 0, 0),
-        "mean": ("REAL", 0, 0),
-        "std_dev": ("REAL", 0, 0),
-    },
+# table -> columns: name, type, ! NOT NULL, * part of the primary key; 12-128r18 annex C, 17-066r1 clause 7
+COLUMNS = {
+    "gpkg_spatial_ref_sys": (
+        "srs_name TEXT!, srs_id INTEGER!*, organization TEXT!, organization_coordsys_id INTEGER!, "
+        "definition TEXT!, description TEXT, definition_12_063 TEXT!"
+    ),
+    "gpkg_contents": (
+        "table_name TEXT!*, data_type TEXT!, identifier TEXT, description TEXT, last_change DATETIME!, "
+        "min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER"
+    ),
+    "gpkg_extensions": "table_name TEXT, column_name TEXT, extension_name TEXT!, definition TEXT!, scope TEXT!",
+    "gpkg_tile_matrix_set": (
+        "table_name TEXT!*, srs_id INTEGER!, min_x DOUBLE!, min_y DOUBLE!, max_x DOUBLE!, max_y DOUBLE!"
+    ),
+    "gpkg_tile_matrix": (
+        "table_name TEXT!*, zoom_level INTEGER!*, matrix_width INTEGER!, matrix_height INTEGER!, "
+        "tile_width INTEGER!, tile_height INTEGER!, pixel_x_size DOUBLE!, pixel_y_size DOUBLE!"
+    ),
+    "gpkg_geometry_columns": (
+        "table_name TEXT!*, column_name TEXT!*, geometry_type_name TEXT!, srs_id INTEGER!, z TINYINT!, m TINYINT!"
+    ),
+    "gpkg_metadata": "id INTEGER!*, md_scope TEXT!, md_standard_uri TEXT!, mime_type TEXT!, metadata TEXT!",
+    "gpkg_metadata_reference": (
+        "reference_scope TEXT!, table_name TEXT, column_name TEXT, row_id_value INTEGER, timestamp DATETIME!, "
+        "md_file_id INTEGER!, md_parent_id INTEGER"
+    ),
+    "gpkg_2d_gridded_coverage_ancillary": (
+        "id INTEGER!*, tile_matrix_set_name TEXT!, datatype TEXT!, scale REAL!, offset REAL!, precision REAL, "
+        "data_null REAL, grid_cell_encoding TEXT, uom TEXT, field_name TEXT, quantity_definition TEXT"
+    ),
+    "gpkg_2d_gridded_tile_ancillary": (
+        "id INTEGER!*, tpudt_name TEXT!, tpudt_id INTEGER!, scale REAL!, offset REAL!, min REAL, max REAL, "
+        "mean REAL, std_dev REAL"
+    ),
 }
-TILE_COLUMNS = {
-    "id": ("INTEGER", 0, 1),
-    "zoom_level": ("INTEGER", 1, 0),
-    "tile_column": ("INTEGER", 1, 0),
-    "tile_row": ("INTEGER", 1, 0),
-    "tile_data": ("BLOB", 1, 0),
-}
+TILE_COLUMNS = "id INTEGER*, zoom_level INTEGER!, tile_column INTEGER!, tile_row INTEGER!, tile_data BLOB!"
 GEOMETRIES = {"GEOMETRY", "POINT", "LINESTRING", "POLYGON", "MULTIPOINT", "MULTILINESTRING", "MULTIPOLYGON"}
 RTREE = {f"rtree_{{}}_geom_{name}" for name in ("insert", "update1", "update2", "update3", "update4", "delete")}
 COVERAGE = "2d-gridded-coverage"
@@ -166,9 +99,15 @@ def _tables(_: Path, find: Find) -> Iterator[str]:
         yield from _same_columns(table, find, COLUMNS[table])
 
 
-def _same_columns(table: str, find: Find, wanted: dict[str, tuple[str, int, int]]) -> Iterator[str]:
+def _columns(words: str) -> dict[str, tuple[str, int, int]]:
+    """-> column: (type, NOT NULL, part of the primary key)."""
+    columns = (column.split() for column in words.split(", "))
+    return {name: (kind.rstrip("!*"), int("!" in kind), int("*" in kind)) for name, kind in columns}
+
+
+def _same_columns(table: str, find: Find, words: str) -> Iterator[str]:
     found = {row[1]: (row[2], row[3], int(row[5] > 0)) for row in find(f'PRAGMA table_info("{table}")')}
-    for column, (kind, required, key) in wanted.items():
+    for column, (kind, required, key) in _columns(words).items():
         # A primary key of one INTEGER column cannot be NULL, with or without NOT NULL in the table definition.
         if column not in found or found[column][::2] != (kind, key) or (not key and found[column][1] != required):
             yield f"annex C: {table}.{column} is {found.get(column)}, not {(kind, required, key)}"

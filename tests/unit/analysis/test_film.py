@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from terrafix_lab.sim.camera.film import Developer, Film
-from terrafix_lab.sim.camera.schedule import Schedule
 
 WIDTH, HEIGHT = 320, 240
 IDEAL = Film(noise=0.0, vignette=0.0, blur_px=0.0, exposure_jitter=0.0, detail=0.0)
@@ -72,21 +71,3 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
     first.develop(image, 1)
     assert np.array_equal(first.develop(image, 9), second.develop(image, 9))
     assert not np.array_equal(first.develop(image, 9), developer(film, seed=4).develop(image, 9))
-
-
-def test_the_schedule_drops_delays_and_stalls_images() -> None:
-    plan = Schedule(
-        rate_hz=4.0, jitter_s=0.01, drop_share=0.1, delay_s=0.05, late_share=0.2, late_s=1.0, stalls_s=((100.0, 160.0),)
-    )
-    pictures = list(plan.exposures(1000.0))
-    assert [p.index for p in pictures] == list(range(4000))
-    assert max(abs(p.t_s - p.index / 4.0) for p in pictures) < 0.05
-    stalled = [p for p in pictures if 100.0 <= p.t_s < 160.0]
-    others = [p for p in pictures if not 100.0 <= p.t_s < 160.0]
-    assert len(stalled) == pytest.approx(240, abs=2) and all(np.isinf(p.arrives_s) for p in stalled)
-    arrived = [p for p in others if np.isfinite(p.arrives_s)]
-    assert len(arrived) / len(others) == pytest.approx(0.9, abs=0.03)
-    delays = np.array([p.arrives_s - p.t_s for p in arrived])
-    assert delays.min() == pytest.approx(0.05) and delays.max() <= 1.05 + 1e-9
-    assert float(np.mean(delays > 0.0501)) == pytest.approx(0.2, abs=0.03)
-    assert list(plan.exposures(10.0)) == pictures[:40]

@@ -5,7 +5,7 @@ import pytest
 
 from inertial_flight import InertialFlight, flown
 from map_matches import with_search
-from simulated_flight import KEYFRAME_EVERY, EstimatorRun, Flight, blind, cov_of, error_m, sigma_m
+from simulated_flight import KEYFRAME_EVERY, EstimatorRun, Flight, cov_of, error_m, sigma_m, without_sight
 from smoother_marginals import JOINT, MARGINAL, recorded_marginals
 from terrafix.core.limits import WINDOW_NODES
 from terrafix.core.pose import log_so3
@@ -14,7 +14,7 @@ from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
 from terrafix.estimator.graph.pose_graph import rebuild_prior
 from terrafix.estimator.state import VELOCITY
-from terrafix.messages import CovarianceMode, Health, MapMatch, Odometry, ThermalBand, Verdict
+from terrafix.messages import CovarianceMode, Health, MapMatch, ThermalBand, Verdict
 
 HOT_FROM, COOL_FROM, END = 12, 24, 28
 FIX = 18  # frame of the map match in the hot stretch
@@ -73,8 +73,7 @@ def test_under_thermal_throttle_late_matches_restarts_and_lost_odometry_need_no_
     assert run.verdicts("map")[FIX - 4].verdict is Verdict.ACCEPTED
     run.feed([with_search(flight.fix(FIX - 1, offset_m=(300.0, -200.0)), relocalized=True)])
     assert "found" in run.verdicts("map")[FIX - 1].detail
-    for i in range(FIX, END):
-        run.feed(blind(m) if isinstance(m, Odometry) else m for m in flight.messages(i) if not isinstance(m, MapMatch))
+    run.fly(flight, FIX, END, without_sight)
     assert computed == []
     assert run.estimate(END - 1).covariance_mode is CovarianceMode.JACOBIAN
 

@@ -10,13 +10,17 @@ from simulated_flight import (
     KEYFRAME_EVERY,
     ORIGIN,
     SPEED_MPS,
+    Alter,
     EstimatorRun,
     Flight,
+    altered,
     blind,
     cov_of,
     error_m,
     sigma_m,
     t_ns,
+    without_fix,
+    without_sight,
 )
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.pose import log_so3
@@ -40,14 +44,6 @@ from terrafix.messages import (
 
 def health(band: ThermalBand) -> Health:
     return Health(t_ns=0, band=band, temperature_c=60.0, throttled=False, disk_free_mb=1000, cause="test")
-
-
-def without_fix(messages: list[Message]) -> list[Message]:
-    return [m for m in messages if not isinstance(m, MapMatch)]
-
-
-def without_sight(messages: list[Message]) -> list[Message]:
-    return [blind(m) if isinstance(m, Odometry) else m for m in without_fix(messages)]
 
 
 # --- accuracy and honesty --------------------------------------------------------------------------------
@@ -136,9 +132,7 @@ def test_a_step_is_claimed_no_wider_for_lying_far_from_its_keyframe() -> None:
     """What stretches all of the way since the keyframe (here a height known to a fifth, no map) stretches a step by its
     own share: steps that are alike are claimed alike."""
     flight, run = Flight(9, seed=4), EstimatorRun()
-    run.feed([msgspec.structs.replace(ORIGIN, agl_sigma_m=20.0)])
-    for i in range(9):
-        run.feed(without_fix(list(flight.messages(i))))
+    run.fly(flight, 0, 9, without_fix, msgspec.structs.replace(ORIGIN, agl_sigma_m=20.0))
     sigmas_m = [m.step_cov_m2[0] ** 0.5 for m in run.published if isinstance(m, Prediction) and m.frame_id]
     assert max(sigmas_m) < 1.3 * min(sigmas_m)
     assert min(sigmas_m) > 0.15 * SPEED_MPS * FRAME_S  # that fifth is claimed
@@ -201,11 +195,7 @@ def test_label_and_age_of_the_last_fix(long_run: EstimatorRun) -> None:
 
 
 def test_before_the_first_fix_there_is_no_age() -> None:
-    flight = Flight(4)
-    run = EstimatorRun()
-    run.feed([ORIGIN])
-    for i in range(4):
-        run.feed(without_fix(flight.messages(i)))
+    run = EstimatorRun().fly(Flight(4), 0, 4, without_fix)
     assert run.estimate(3).last_anchor_age_ms == -1
     assert run.estimate(3).source_label is SourceLabel.VISUAL_PROPAGATED
     assert sigma_m(run.estimate(3)) > ORIGIN.start_sigma_m * 0.9
@@ -224,9 +214,7 @@ def test_two_runs_publish_the_same() -> None:
 
 def test_sigma_grows_while_nothing_is_seen() -> None:
     flight = Flight(60, seed=1)
-    run = EstimatorRun().fly(flight, 0, 40)
-    for i in range(40, 60):
-        run.feed(without_sight(flight.messages(i)))
+    run = EstimatorRun().fly(flight, 0, 40).fly(flight, 40, 60, without_sight)
     sigmas = [sigma_m(run.estimate(i)) for i in range(39, 60)]
     assert (np.diff(sigmas) > 0).all()
     assert sigmas[-1] > 3 * sigmas[0] and sigmas[-1] > 10.0
@@ -237,10 +225,9 @@ def test_sigma_grows_while_nothing_is_seen() -> None:
 
 def test_odometry_alone_drifts_less_than_nothing_at_all() -> None:
     flight = Flight(60, seed=1)
-    seen, unseen = EstimatorRun().fly(flight, 0, 40), EstimatorRun().fly(flight, 0, 40)
-    for i in range(40, 60):
-        seen.feed(without_fix(flight.messages(i)))
-        unseen.feed(without_sight(flight.messages(i)))
+    seen, unseen = (
+        EstimatorRun().fly(flight, 0, 40).fly(flight, 40, 60, alter) for alter in (without_fix, without_sight)
+    )
     assert sigma_m(seen.estimate(59)) < 0.5 * sigma_m(unseen.estimate(59))
     drift = np.linalg.norm(error_m(seen.estimate(59), flight)[:2])
     assert drift < 0.1 * 20 * FRAME_S * SPEED_MPS + 5.0
@@ -248,9 +235,7 @@ def test_odometry_alone_drifts_less_than_nothing_at_all() -> None:
 
 def test_after_a_gap_a_fix_brings_it_back() -> None:
     flight = Flight(80, seed=2)
-    run = EstimatorRun().fly(flight, 0, 30)
-    for i in range(30, 60):
-        run.feed(without_sight(flight.messages(i)))
+    run = EstimatorRun().fly(flight, 0, 30).fly(flight, 30, 60, without_sight)
     lost = np.linalg.norm(error_m(run.estimate(59), flight)[:2])
     run.fly(flight, 60, 80)
     assert run.verdicts("map")[63].verdict is Verdict.ACCEPTED
@@ -280,9 +265,7 @@ def test_a_bad_frame_costs_that_frame_only(bad: Verdict) -> None:
 def test_a_keyframe_that_was_lost_is_replaced() -> None:
     """The frame that was to be the keyframe is bad, and later frames refer to one that the graph never had."""
     flight = Flight(40, seed=4)
-    run = EstimatorRun().fly(flight, 0, 21)
-    for i in range(22, 40):  # frame 21 never comes, and 22 to 24 refer to it
-        run.feed(flight.messages(i))
+    run = EstimatorRun().fly(flight, 0, 21).fly(flight, 22, 40)  # 21 never comes, and 22 to 24 refer to it
     verdicts = run.verdicts("odometry")
     assert Verdict.ACCEPTED not in {verdicts[i].verdict for i in (22, 23, 24)}
     # Frames that refer to a node which the graph never had are a fragment of their own until motion has joined it.
@@ -297,13 +280,13 @@ def test_a_keyframe_that_was_lost_is_replaced() -> None:
 def test_a_fix_far_away_is_refused_and_the_next_right_one_taken(away_m: float) -> None:
     flight = Flight(60, seed=6)
     run = EstimatorRun().fly(flight, 0, 45)
-    answers = run.feed([*without_fix(flight.messages(45)), flight.fix(45, (0.6 * away_m, 0.8 * away_m))])
+    answers = run.feed([*altered(flight.messages(45), without_fix), flight.fix(45, (0.6 * away_m, 0.8 * away_m))])
     verdict = run.verdicts("map")[45]
     assert verdict.verdict is Verdict.INNOVATION
     assert verdict.mahalanobis2 is not None and verdict.mahalanobis2 > 22.5
     assert np.linalg.norm(error_m(run.estimate(45), flight)[:2]) < 12.0
     assert sum(isinstance(m, NavEstimate) for m in answers) == 1  # nothing new came of it
-    run.feed([*without_fix(flight.messages(46)), flight.fix(46)])
+    run.feed([*altered(flight.messages(46), without_fix), flight.fix(46)])
     assert run.verdicts("map")[46].verdict is Verdict.ACCEPTED
     assert np.linalg.norm(error_m(run.estimate(46), flight)[:2]) < 8.0
 
@@ -313,7 +296,7 @@ def test_wrong_fixes_that_do_not_agree_are_all_refused() -> None:
     run = EstimatorRun().fly(flight, 0, 40)
     for i in range(40, 70):
         at = rng.uniform(-400.0, 400.0, 2) + np.sign(rng.normal(size=2)) * 100.0
-        run.feed([*without_fix(flight.messages(i)), flight.fix(i, (float(at[0]), float(at[1])))])
+        run.feed([*altered(flight.messages(i), without_fix), flight.fix(i, (float(at[0]), float(at[1])))])
         assert np.linalg.norm(error_m(run.estimate(i), flight)[:2]) < 40.0
     assert {run.verdicts("map")[i].verdict for i in range(40, 70)} == {Verdict.INNOVATION}
 
@@ -323,7 +306,7 @@ def test_one_mistake_seen_many_times_is_not_believed() -> None:
     flight = Flight(60, seed=8, speed_mps=0.3)
     run = EstimatorRun().fly(flight, 0, 40)
     for i in range(40, 60):
-        run.feed([*without_fix(flight.messages(i)), flight.fix(i, (200.0, 0.0))])
+        run.feed([*altered(flight.messages(i), without_fix), flight.fix(i, (200.0, 0.0))])
     assert {run.verdicts("map")[i].verdict for i in range(40, 60)} == {Verdict.INNOVATION}
 
 
@@ -334,7 +317,7 @@ def test_fixes_over_new_ground_that_agree_with_each_other_win() -> None:
     restarted = -1
     for i in range(30, 90):
         fixes: list[Message] = [flight.fix(i, offset)] if i % 4 == 0 else []
-        run.feed([*without_fix(flight.messages(i)), *fixes])
+        run.feed([*altered(flight.messages(i), without_fix), *fixes])
         if restarted < 0 and fixes and run.verdicts("map")[i].verdict is Verdict.ACCEPTED:
             restarted = i
     assert 40 <= restarted <= 70  # not on the first ones, and not never
@@ -354,7 +337,7 @@ def coarsely_led(last: int) -> tuple[Flight, EstimatorRun, tuple[float, float]]:
             wrong = [
                 with_pose(msgspec.structs.replace(flight.fix(i, away_m), inliers=0, matches=[]), position_only=True)
             ]
-        run.feed([*without_fix(flight.messages(i)), *wrong])
+        run.feed([*altered(flight.messages(i), without_fix), *wrong])
     return flight, run, away_m
 
 
@@ -385,7 +368,7 @@ def test_coarse_matches_confirm_another_place_that_poses_have_shown() -> None:
         wrong = flight.fix(i, away_m)
         if i >= 42:
             wrong = with_pose(msgspec.structs.replace(wrong, inliers=0, matches=[]), position_only=True)
-        run.feed([*without_fix(flight.messages(i)), wrong])
+        run.feed([*altered(flight.messages(i), without_fix), wrong])
     restarted = [i for i in range(40, 60) if run.verdicts("map")[i].detail.startswith("restarted")]
     assert len(restarted) == 1 and 48 < restarted[0] < 52  # after half of the height
     assert min(sigma_m(run.estimate(i)) for i in range(41, 60)) > 50.0
@@ -398,7 +381,7 @@ def test_a_start_that_nothing_confirmed_is_left_for_two_clear_poses(inliers: int
     run.feed([ORIGIN])
     for i in range(40):
         fixes = [msgspec.structs.replace(flight.fix(i, offset), inliers=inliers)] if i in (20, 22) else []
-        run.feed([*without_fix(flight.messages(i)), *fixes])
+        run.feed([*altered(flight.messages(i), without_fix), *fixes])
     assert run.verdicts("map")[20].verdict is Verdict.INNOVATION and run.verdicts("map")[22].verdict is second
     error = error_m(run.estimate(39), flight, offset)[:2]
     assert (np.linalg.norm(error) < 15.0) == (second is Verdict.ACCEPTED)
@@ -408,15 +391,13 @@ def test_a_start_that_nothing_confirmed_is_left_for_two_clear_poses(inliers: int
 def test_a_place_that_was_found_late_is_carried_to_the_newest_frame() -> None:
     """A search answers about a frame from two seconds ago; the vehicle has flown on since."""
     flight, offset = Flight(60, seed=9), (480.0, -340.0)
-    run = EstimatorRun().fly(flight, 0, 30)
-    for i in range(30, 41):
-        run.feed(without_fix(flight.messages(i)))
+    run = EstimatorRun().fly(flight, 0, 30).fly(flight, 30, 41, without_fix)
     found = with_search(flight.fix(36, offset), relocalized=True)
     estimates = [m for m in run.feed([found]) if isinstance(m, NavEstimate)]
     assert [(m.frame_id, m.last_anchor_age_ms) for m in estimates] == [(40, 2000)]
     for i in range(40, 60):
         if i > 40:
-            run.feed(without_fix(flight.messages(i)))
+            run.feed(altered(flight.messages(i), without_fix))
         off_m = error_m(run.estimate(i), flight, offset)[:2]
         assert np.linalg.norm(off_m) < 15.0 + 0.5 * (i - 40)
         assert off_m @ np.linalg.solve(cov_of(run.estimate(i))[:2, :2], off_m) < 12.0
@@ -452,10 +433,7 @@ def test_whatever_is_missing_the_flight_goes_on(knows: set[str]) -> None:
 
 def test_no_telemetry_at_all() -> None:
     flight = Flight(40, seed=12)
-    run = EstimatorRun()
-    run.feed([ORIGIN])
-    for i in range(40):
-        run.feed(m for m in flight.messages(i) if not isinstance(m, VehicleState))
+    run = EstimatorRun().fly(flight, 0, 40, lambda m: None if isinstance(m, VehicleState) else m)
     assert np.linalg.norm(error_m(run.estimate(39), flight)[:2]) < 15.0
 
 
@@ -496,22 +474,19 @@ def test_another_origin_begins_another_flight() -> None:
     flight = Flight(30, seed=3)
     run = EstimatorRun().fly(flight, 0, 20)
     run.feed([msgspec.structs.replace(ORIGIN, t_ns=5)])
-    run.feed(without_fix(flight.messages(20)))
+    run.feed(altered(flight.messages(20), without_fix))
     estimate = run.estimate(20)
     assert estimate.last_anchor_age_ms == -1 and sigma_m(estimate) > 10.0
 
 
+def of_map(**changes: object) -> Alter:
+    """Map matches with other fields."""
+    return lambda m: msgspec.structs.replace(m, **changes) if isinstance(m, MapMatch) else m
+
+
 def test_the_error_of_the_map_is_added_once_a_map_has_placed_us() -> None:
     """... in position, whole, and not before: a start coordinate does not come from the map."""
-    flight = Flight(30)
-    exact, off = EstimatorRun(), EstimatorRun()
-    for run, map_sigma_m in ((exact, 0.0), (off, 5.0)):
-        run.feed([ORIGIN])
-        for i in range(30):
-            messages = flight.messages(i)
-            run.feed(
-                msgspec.structs.replace(m, map_sigma_m=map_sigma_m) if isinstance(m, MapMatch) else m for m in messages
-            )
+    exact, off = (EstimatorRun().fly(Flight(30), 0, 30, of_map(map_sigma_m=sigma_m)) for sigma_m in (0.0, 5.0))
     first = [next(m for m in run.published if isinstance(m, NavEstimate)) for run in (exact, off)]
     assert first[0].cov == first[1].cov
     added = cov_of(off.estimate(29)) - cov_of(exact.estimate(29))
@@ -521,19 +496,10 @@ def test_the_error_of_the_map_is_added_once_a_map_has_placed_us() -> None:
 
 def test_over_hills_odometry_is_trusted_less() -> None:
     """What the ground departs from the plane moves all tracked points together: it does not average out."""
-    flight = Flight(30)
-    claims = []
+    flight, claims = Flight(30), []
     for relief_m in (0.0, 8.0):
-        run = EstimatorRun()
-        run.feed([ORIGIN])
-        for i in range(30):
-            messages = flight.messages(i)
-            kept = [m for m in messages if i < 10 or not isinstance(m, MapMatch)]
-            run.feed(
-                msgspec.structs.replace(m, ground=plane(0.0, relief_m=relief_m)) if isinstance(m, MapMatch) else m
-                for m in kept
-            )
-        claims.append(sigma_m(run.estimate(29)))
+        run = EstimatorRun().fly(flight, 0, 10, of_map(ground=plane(0.0, relief_m=relief_m)))
+        claims.append(sigma_m(run.fly(flight, 10, 30, without_fix).estimate(29)))
     assert claims[1] > 1.1 * claims[0]
 
 
@@ -560,7 +526,7 @@ def test_telemetry_that_begins_after_the_first_frame_is_a_new_beginning() -> Non
         messages = flight.messages(i)
         if i == 0:
             messages = [m for m in messages if not isinstance(m, VehicleState | MapMatch)]
-        run.feed(without_fix(messages) if i < 3 else messages)
+        run.feed(altered(messages, without_fix) if i < 3 else messages)
     errors = [float(np.linalg.norm(error_m(run.estimate(i), flight)[:2])) for i in range(10, 40)]
     heights = [abs(error_m(run.estimate(i), flight)[2]) for i in range(1, 40)]
     assert max(errors) < 15.0 and max(heights) < 30.0

@@ -351,8 +351,7 @@ def test_a_height_too_low_for_matching_is_reset_to_the_reported_one() -> None:
     assert list(resets(listener).items())[:2] == [(0, STARTED), (19, FOUND)]
     assert list(resets(listener)) == [0, 19, 20] and "are reported" in resets(listener)[20]
     assert listener.estimate(20).agl_m == pytest.approx(flight.p_m[20, 2], abs=15.0)
-    for i in range(21, 30):
-        listener.feed(flight.messages(i))
+    listener.fly(flight, 21, 30)
     assert list(resets(listener)) == [0, 19, 20]
 
 

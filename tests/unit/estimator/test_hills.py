@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, EstimatorRun, Flight, cov_of, error_m
+from simulated_flight import EstimatorRun, Flight, cov_of, error_m, without_fix
 from terrafix.estimator.models.terrain_roughness import ROUGHNESS_CANDIDATES, TerrainRoughness
-from terrafix.messages import MapMatch
 
 FRAMES = 240
 
@@ -44,10 +43,7 @@ def test_height_without_map_matches_does_not_drift_down(seed: int) -> None:
     """Two minutes of odometry alone: factors in metres pulled the camera down to half of its height, with a sigma of
     8 %."""
     flight = Flight(300, seed=seed)
-    listener = EstimatorRun()
-    listener.feed([ORIGIN])
-    for i in range(flight.frames):
-        listener.feed(m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i > 60))
+    listener = EstimatorRun().fly(flight, 0, 61).fly(flight, 61, flight.frames, without_fix)
     for i in range(60, flight.frames, 20):
         estimate = listener.estimate(i)
         assert abs(estimate.agl_m - flight.p_m[i, 2]) < 3.0 * np.sqrt(estimate.cov[14])
@@ -62,10 +58,7 @@ def test_hard_braking_without_imu_does_not_change_the_height(seed: int) -> None:
     """From 12 m/s to zero within a frame and off again, every ten seconds, without IMU. Gaussian increments kept the
     cruise velocity and changed the height instead, which scales the odometry: errors were twice as large."""
     flight = Flight(220, seed=seed, stop_and_go=True, telemetry=frozenset({"yaw", "height"}))
-    listener = EstimatorRun()
-    listener.feed([ORIGIN])
-    for i in range(flight.frames):
-        listener.feed(m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i > 40))
+    listener = EstimatorRun().fly(flight, 0, 41).fly(flight, 41, flight.frames, without_fix)
     for i in range(40, flight.frames):
         estimate = listener.estimate(i)
         off_m = error_m(estimate, flight)[:2]

@@ -150,8 +150,7 @@ def test_a_flight_from_there_is_a_flight() -> None:
     flight = Flight(30, seed=5)
     run = EstimatorRun()
     run.feed([UNKNOWN, start_at(0, *flight.p_m[0, :2], ground_m=0.0)])
-    for i in range(30):
-        run.feed(flight.messages(i))
+    run.feed(message for i in range(30) for message in flight.messages(i))
     assert {v.verdict for v in run.verdicts("map").values()} == {Verdict.ACCEPTED}
     assert np.linalg.norm(error_m(run.estimate(29), flight)[:2]) < 10.0
 

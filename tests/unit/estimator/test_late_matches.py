@@ -7,8 +7,18 @@ import numpy as np
 import pytest
 
 from map_matches import plane, with_search
-from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m, sigma_m, t_ns
-from terrafix.messages import MapMatch, Message, NavEstimate, Odometry, SourceEnded, SourceLabel, Verdict
+from simulated_flight import (
+    ORIGIN,
+    EstimatorRun,
+    Flight,
+    cov_of,
+    error_m,
+    sigma_m,
+    t_ns,
+    without_fix,
+    without_sight,
+)
+from terrafix.messages import MapMatch, Message, NavEstimate, SourceEnded, SourceLabel, Verdict
 
 LATEST = 4  # frames: two seconds
 
@@ -75,9 +85,7 @@ def test_covariance_is_consistent_while_matches_are_late() -> None:
 
 def test_a_match_of_an_old_frame_publishes_the_newest_position_and_improves_it() -> None:
     flight = Flight(40, seed=2)
-    run = EstimatorRun().fly(flight, 0, 28)
-    for i in range(28, 40):
-        run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
+    run = EstimatorRun().fly(flight, 0, 28).fly(flight, 28, 40, without_fix)
     before = sigma_m(run.estimate(39))
     estimates = [m for m in run.feed([flight.fix(37)]) if isinstance(m, NavEstimate)]
     assert [(m.frame_id, m.t_ns, m.emitted_at_ns) for m in estimates] == [(39, t_ns(39), t_ns(39))]
@@ -89,10 +97,7 @@ def test_a_match_of_an_old_frame_publishes_the_newest_position_and_improves_it()
 
 def test_a_late_match_does_not_make_a_blind_frame_a_seen_one() -> None:
     flight = Flight(40, seed=2)
-    run = EstimatorRun().fly(flight, 0, 37)
-    for i in range(37, 40):
-        messages = [m for m in flight.messages(i) if not isinstance(m, MapMatch)]
-        run.feed([blind(m) if isinstance(m, Odometry) else m for m in messages])
+    run = EstimatorRun().fly(flight, 0, 37).fly(flight, 37, 40, without_sight)
     run.feed([flight.fix(36)])
     assert run.verdicts("map")[36].verdict is Verdict.ACCEPTED
     assert run.estimate(39).source_label is SourceLabel.DEAD_RECKONED
@@ -113,9 +118,7 @@ def test_of_two_matches_the_newer_one_knows_the_ground_below() -> None:
 
 def test_what_a_search_found_knows_its_ground_however_late_it_is() -> None:
     flight = Flight(43, seed=9)
-    run = EstimatorRun().fly(flight, 0, 30)
-    for i in range(30, 42):
-        run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
+    run = EstimatorRun().fly(flight, 0, 30).fly(flight, 30, 42, without_fix)
     newer = msgspec.structs.replace(flight.fix(41), verdict=Verdict.AMBIGUOUS, ground=plane(0.0))
     found = with_search(msgspec.structs.replace(flight.fix(36, (300.0, 200.0)), ground=plane(20.0)), relocalized=True)
     run.feed([newer, found])

@@ -18,7 +18,7 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
-from terrafix_lab.sim.true_messages import first_odometry, map_match, seen_from
+from terrafix_lab.sim.true_messages import first_odometry, map_match, odometry
 
 FRAME_HZ, STANDS_S, SEEN_M, MAPPED_M = 5, 12.0, 8.0, 30.0
 MS = 1_000_000
@@ -67,20 +67,7 @@ def taken_off(seed: int, deck_mps: float, seconds: float) -> EstimatorRun:
             keyframe = i
             run.feed([first_odometry(t_ns, i)])
             continue
-        seen = seen_from(poses[keyframe], poses[i], rng)
-        run.feed(
-            [
-                Odometry(
-                    t_ns=t_ns,
-                    frame_id=i,
-                    keyframe_id=keyframe,
-                    verdict=Verdict.ACCEPTED,
-                    becomes_keyframe=i % 3 == 0,
-                    fragment_id=0,
-                    **seen,
-                )
-            ]
-        )
+        run.feed([odometry(t_ns, (keyframe, i), (poses[keyframe], poses[i]), rng, becomes_keyframe=i % 3 == 0)])
         keyframe = i if i % 3 == 0 else keyframe
         if up_m(t_s) > MAPPED_M and i % 4 == 0:
             run.feed([map_match(t_ns, i, poses[i], rng)])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, EstimatorRun, Flight, cov_of, error_m
-from terrafix.messages import MapMatch, Prediction
+from simulated_flight import EstimatorRun, Flight, cov_of, error_m, without_fix
+from terrafix.messages import Prediction
 
 FIRST_MATCH = 36
 
@@ -12,9 +12,7 @@ FIRST_MATCH = 36
 @pytest.mark.parametrize("knows", [{"yaw", "attitude"}, set()], ids=["attitude", "nothing"])
 def test_the_height_stays_unknown_until_a_match_measures_it(knows: set[str]) -> None:
     flight, listener = Flight(72, seed=3, telemetry=frozenset(knows)), EstimatorRun()
-    listener.feed([ORIGIN])
-    for i in range(flight.frames):
-        listener.feed(m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i < FIRST_MATCH))
+    listener.fly(flight, 0, FIRST_MATCH, without_fix).fly(flight, FIRST_MATCH, flight.frames)
     predicted = {m.frame_id: m for m in listener.published if isinstance(m, Prediction)}
     for i in range(min(predicted), FIRST_MATCH + 1):
         off_m = predicted[i].agl_m - float(flight.p_m[i, 2])

@@ -85,9 +85,7 @@ def test_a_height_above_the_sea_is_known_with_an_elevation_of_start_or_map(
     ground_m: float | None, dem: bool, known: bool
 ) -> None:
     flight, run = Flight(4, seed=5, dem=dem), EstimatorRun()
-    run.feed([msgspec.structs.replace(ORIGIN, ground_amsl_m=ground_m)])
-    for i in range(4):
-        run.feed(flight.messages(i))
+    run.fly(flight, 0, 4, origin=msgspec.structs.replace(ORIGIN, ground_amsl_m=ground_m))
     run.feed([SourceEnded(t_ns=t_ns(4), frames=4)])
     assert run.estimate(3).amsl_known is known
     heights = [pose.alt_amsl_m for m in run.published if isinstance(m, Refinement) for pose in m.poses]

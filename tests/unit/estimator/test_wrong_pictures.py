@@ -25,6 +25,7 @@ from terrafix.messages import (
     Prediction,
     Verdict,
 )
+from terrafix_lab.sim.true_messages import first_odometry
 
 SECONDS, FIRST, END = 25, 50, 100  # frames of the fault: 10 to 20 s
 KEYFRAME_EVERY = 5
@@ -118,9 +119,7 @@ def images(
     t_ns, faulty = round(i * FRAME_S * 1e9), FIRST <= i < END
     keyframe, fragment = max((i - 1) // KEYFRAME_EVERY * KEYFRAME_EVERY, 0), (i >= FIRST and not tied) + (i >= END)
     if i in (0, END) or (i == FIRST and not tied):
-        odometry = Odometry(
-            t_ns=t_ns, frame_id=i, keyframe_id=i, verdict=Verdict.ACCEPTED, becomes_keyframe=True, fragment_id=fragment
-        )
+        odometry = first_odometry(t_ns, i, fragment)
     else:
         odometry = flight.registered(i, keyframe, t_ns, rng, becomes_keyframe=i % KEYFRAME_EVERY == 0)
         odometry = msgspec.structs.replace(odometry, fragment_id=fragment)

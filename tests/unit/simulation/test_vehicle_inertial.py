@@ -44,7 +44,7 @@ def strapdown(states: list[State]) -> np.ndarray:
 @pytest.mark.parametrize("flown", [IN_THE_AIR, FROM_THE_GROUND])
 def test_a_strapdown_integration_reproduces_the_trajectory(vehicle: type[Plane] | type[Copter], flown: Mission) -> None:
     made = vehicle(flown, PLACE, hills, seed=3)
-    states = fly(made, made.state, SECONDS)
+    states = fly(made, SECONDS)
     assert np.ptp(positions(states)[:, 0]) > 100.0  # the vehicle has moved
     error_m = np.linalg.norm(strapdown(states) - positions(states), axis=1)
     assert error_m.max() < 0.05
@@ -53,7 +53,7 @@ def test_a_strapdown_integration_reproduces_the_trajectory(vehicle: type[Plane] 
 @pytest.mark.parametrize("vehicle", [Plane, Copter])
 def test_velocity_is_the_derivative_of_position(vehicle: type[Plane] | type[Copter]) -> None:
     made = vehicle(IN_THE_AIR, PLACE, hills, seed=5)
-    states = fly(made, made.state, SECONDS)
+    states = fly(made, SECONDS)
     velocity = np.array([s.velocity_enu_mps for s in states])
     difference = np.gradient(positions(states), STEP_S, axis=0)
     assert np.abs(difference - velocity)[1:-1].max() < 0.15
@@ -62,7 +62,7 @@ def test_velocity_is_the_derivative_of_position(vehicle: type[Plane] | type[Copt
 @pytest.mark.parametrize("vehicle", [Plane, Copter])
 def test_forces_and_rates_are_those_of_a_small_aircraft(vehicle: type[Plane] | type[Copter]) -> None:
     made = vehicle(FROM_THE_GROUND, PLACE, hills, seed=5)
-    states = fly(made, made.state, SECONDS)
+    states = fly(made, SECONDS)
     force = np.array([s.force_b_mps2 for s in states])
     rates = np.array([s.rates_b_radps for s in states])
     assert np.allclose(force[1:100], [0.0, 0.0, 9.80665 * -1.0], atol=1e-9)  # standing
@@ -76,6 +76,6 @@ def test_the_flight_is_a_function_of_the_seed(vehicle: type[Plane] | type[Copter
     tracks = []
     for seed in (1, 1, 2):
         made = vehicle(IN_THE_AIR, PLACE, hills, seed=seed)
-        tracks.append(positions(fly(made, made.state, 20.0)))
+        tracks.append(positions(fly(made, 20.0)))
     assert np.array_equal(tracks[0], tracks[1])
     assert np.abs(tracks[0] - tracks[2]).max() > 0.1

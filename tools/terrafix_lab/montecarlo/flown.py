@@ -6,28 +6,30 @@ earth is flat here as in the estimator; geodesy is not tested."""
 import math
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.messages import Imu, Message, Origin, VehicleState
+from terrafix.messages import Message, Origin, VehicleState
 from terrafix_lab.faults.edits import Span
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.ground import Terrain
 from terrafix_lab.montecarlo.plan import FlightPlan
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.camera.mount import Fixed, Gimbal
+from terrafix_lab.sim.flights.path import STEP_S
 from terrafix_lab.sim.interfaces import Readings, State
 from terrafix_lab.sim.sensors.errors import SensorErrors
 from terrafix_lab.sim.sensors.suite import VehicleSensors
+from terrafix_lab.sim.true_messages import flown, vehicle_state
 from terrafix_lab.sim.vehicle.copter import Copter, CopterLimits
 from terrafix_lab.sim.vehicle.plane import Plane, PlaneLimits
 from terrafix_tools.mission.course import course
 from terrafix_tools.mission.items import Box, Mission
 
 LAT_DEG, LON_DEG = 48.0, 11.0  # any place: only the estimator's conversions to and from the local frame use it
-STEP_S = 0.02
 HALF_BOX_M = 1500.0
 SPARE = 1.2  # length of the course over what is flown of it
 CLIMBS = 0.25  # 1-sigma of a waypoint's height, as a share of the flight's
@@ -95,10 +97,8 @@ def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
     hanging = Gimbal(seed=plan.seed) if plan.gimbal else Fixed()
     r_b_c = Mount.of(plan.camera).r_b_c()
     tilt = exp_so3(np.array([*plan.mount_error_rad, 0.0]))
-    first = vehicle.state
-    claimed = first.p_b_in_w_m[:2] + np.array(plan.start_error_m)
+    claimed = vehicle.state.p_b_in_w_m[:2] + np.array(plan.start_error_m)
     home_m = terrain.bare_at_m(float(claimed[0]), float(claimed[1]))
-    every = TELEMETRY_EVERY if plan.has_imu else SLOW_EVERY
     frame_every = round(1.0 / (plan.frame_hz * STEP_S))
     lag = round(plan.picture_lag_s / STEP_S)
     frames: list[Shot] = []
@@ -106,28 +106,24 @@ def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
     taken: Shot | None = None  # the picture that is delivered next, when pictures are late
     telemetry: list[list[Message]] = []
     waiting: list[Message] = []
-    batch: list[Readings] = []
     path_m, paths_m = 0.0, []
-    state = first
 
     def shot(at: State) -> Shot:
         held = hanging.r_w_c(at)
         p_m = at.p_b_in_w_m - np.array([*claimed, 0.0])
         return Shot(at.t_s, p_m, held @ tilt, held @ r_b_c.T, at.velocity_enu_mps)
 
-    for i in range(math.floor(plan.duration_s / STEP_S)):
-        if i:
-            state = vehicle.step(STEP_S, None)
-            path_m += float(np.hypot(*state.velocity_enu_mps[:2])) * STEP_S
-        if plan.has_imu or i % every == 0:
-            readings = sensors.read(state)
-            if i % every == 0:
-                waiting.append(_vehicle_state(plan, readings, home_m))
-            if plan.has_imu:
-                batch.append(readings)
-        if len(batch) == IMU_BATCH:
-            waiting.append(imu_of(batch, "montecarlo"))
-            batch = []
+    steps = flown(
+        vehicle,
+        sensors,
+        math.floor(plan.duration_s / STEP_S),
+        lambda readings: _vehicle_state(plan, readings, home_m),
+        state_every=TELEMETRY_EVERY if plan.has_imu else SLOW_EVERY,
+        imu_batch=IMU_BATCH if plan.has_imu else 0,
+    )
+    for i, (state, sent) in enumerate(steps):
+        path_m += float(np.hypot(*state.velocity_enu_mps[:2])) * STEP_S if i else 0.0
+        waiting += sent
         if i % frame_every == 0:
             frames.append(shot(state))
             pictures.append(replace(taken or frames[-1], t_s=state.t_s))
@@ -165,23 +161,10 @@ def _mission(plan: FlightPlan, frame: LocalFrame) -> Mission:
 
 def _vehicle_state(plan: FlightPlan, readings: Readings, home_m: float) -> VehicleState:
     """As the link publishes it. With a gimbal the roll and pitch of the camera are not reported."""
-    return VehicleState(
-        t_ns=round(readings.t_s * 1e9),
-        source="montecarlo",
-        yaw_rad=readings.yaw_rad,
-        pitch_rad=None if plan.gimbal else readings.pitch_rad,
-        roll_rad=None if plan.gimbal else readings.roll_rad,
-        agl_m=plan.height_scale * (readings.baro_amsl_m - home_m),
-        armed=True,
-        airspeed_mps=readings.airspeed_mps,
-    )
-
-
-def imu_of(batch: list[Readings], source: str) -> Imu:
-    """The inertial readings of a batch as one message, at the time of the last."""
-    newest_ns = round(batch[-1].t_s * 1e9)
-    samples = [(newest_ns - round(r.t_s * 1e9), *r.accel_b_mps2.tolist(), *r.gyro_b_radps.tolist()) for r in batch]
-    return Imu(t_ns=newest_ns, source=source, samples=samples)
+    state = vehicle_state(readings, home_m)
+    assert state.agl_m is not None
+    state = msgspec.structs.replace(state, agl_m=plan.height_scale * state.agl_m)
+    return msgspec.structs.replace(state, pitch_rad=None, roll_rad=None) if plan.gimbal else state
 
 
 def _origin(plan: FlightPlan, home_m: float) -> Origin:

@@ -87,6 +87,10 @@ class Readings:
 class Vehicle(Protocol):
     """A vehicle that flies its mission on a given navigation solution."""
 
+    @property
+    def state(self) -> State:
+        """Returns the true state now."""
+
     def step(self, dt_s: float, navigation: Navigation | None) -> State:
         """Advances by ``dt_s``. ``navigation`` None: it steers by the truth."""
 

@@ -1,9 +1,11 @@
-"""Odometry and map matches of a camera whose poses are known, for flights as messages, without images.
+"""Messages of a vehicle and a camera whose truth is known, for flights without images: telemetry, odometry, map
+matches, estimates.
 
-The ground is flat, at height zero. Every error is drawn from the distribution that its message states. A pose is R_w_c
-(3, 3) and the position (3,) of the camera, east, north, up [m]."""
+Odometry and matches are of flat ground at height zero. Every error is drawn from the distribution that its message
+states. A pose is R_w_c (3, 3) and the position (3,) of the camera, east, north, up [m]."""
 
 import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -12,13 +14,99 @@ import numpy as np
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.measurements.map_pose import ROOFS
-from terrafix.messages import GroundPlane, MapMatch, MapPose, MatchPlace, Odometry, Quat, Verdict
+from terrafix.messages import (
+    CovarianceMode,
+    GroundPlane,
+    Imu,
+    MapMatch,
+    MapPose,
+    MatchPlace,
+    Message,
+    NavEstimate,
+    Odometry,
+    Quat,
+    SourceLabel,
+    VehicleState,
+    Verdict,
+)
+from terrafix_lab.sim.flights.path import states_of
+from terrafix_lab.sim.interfaces import Readings, Sensors, State, Vehicle
 
 Pose = tuple[np.ndarray, np.ndarray]
 
 PAIRS, SIGMA_NORM = 40, 1.0 / 560.0
 # Sigmas of a map fix: east, north, up [m], rotation about east, north, up [rad].
 FIX_SIGMAS = np.array([2.0, 2.0, 3.0, math.radians(1.0), math.radians(1.0), math.radians(0.8)])
+
+
+def flown(
+    vehicle: Vehicle,
+    sensors: Sensors,
+    count: int,
+    state_of: Callable[[Readings], VehicleState],
+    *,
+    state_every: int,
+    imu_batch: int,
+) -> Iterator[tuple[State, list[Message]]]:
+    """-> ``count`` true states, and the telemetry that follows each: every ``state_every`` steps that of ``state_of``,
+    and an Imu of every ``imu_batch`` readings; 0: there is none, and readings are taken for the states alone."""
+    batch: list[Readings] = []
+    for i, state in enumerate(states_of(vehicle, count)):
+        sent: list[Message] = []
+        if imu_batch or i % state_every == 0:
+            batch.append(sensors.read(state))
+        if i % state_every == 0:
+            sent.append(state_of(batch[-1]))
+        if len(batch) >= imu_batch:
+            sent += [imu_of(batch)] if imu_batch else []
+            batch = []
+        yield state, sent
+
+
+def vehicle_state(readings: Readings, home_amsl_m: float = 0.0) -> VehicleState:
+    """As the link publishes it of a vehicle in the air, with the barometric height above ``home_amsl_m``."""
+    return VehicleState(
+        t_ns=round(readings.t_s * 1e9),
+        source="simulated",
+        yaw_rad=readings.yaw_rad,
+        pitch_rad=readings.pitch_rad,
+        roll_rad=readings.roll_rad,
+        agl_m=readings.baro_amsl_m - home_amsl_m,
+        armed=True,
+        airspeed_mps=readings.airspeed_mps,
+    )
+
+
+def imu_of(batch: list[Readings]) -> Imu:
+    """The inertial readings of a batch as one message, at the time of the last."""
+    newest_ns = round(batch[-1].t_s * 1e9)
+    samples = [(newest_ns - round(r.t_s * 1e9), *r.accel_b_mps2.tolist(), *r.gyro_b_radps.tolist()) for r in batch]
+    return Imu(t_ns=newest_ns, source="simulated", samples=samples)
+
+
+def estimate(
+    t_ns: int, lat_deg: float, lon_deg: float, *, sigmas: tuple[float, float, float], **changes: Any
+) -> NavEstimate:
+    """That of a vehicle at rest at a place, anchored and published at once. ``sigmas``: 1-sigma of each horizontal axis
+    and of the height [m], and of the attitude [rad]; ``changes``: fields with other values."""
+    horizontal_m, up_m, angle_rad = sigmas
+    fields: dict[str, Any] = {
+        "t_ns": t_ns,
+        "frame_id": t_ns // 1_000_000,
+        "lat_deg": lat_deg,
+        "lon_deg": lon_deg,
+        "alt_amsl_m": 620.0,
+        "agl_m": 120.0,
+        "velocity_enu_mps": (0.0, 0.0, 0.0),
+        "velocity_sigma_mps": 0.5,
+        "q_w_b": (1.0, 0.0, 0.0, 0.0),
+        "cov": tuple(np.diag(np.square([horizontal_m] * 2 + [up_m] + [angle_rad] * 3)).ravel().tolist()),
+        "source_label": SourceLabel.SATELLITE_ANCHORED,
+        "covariance_mode": CovarianceMode.MARGINALS,
+        "last_anchor_age_ms": 0,
+        "emitted_at_ns": t_ns,
+    }
+    return NavEstimate(**fields | changes)
 
 
 def homography(from_pose: Pose, to_pose: Pose) -> np.ndarray:
@@ -47,6 +135,23 @@ def seen_from(keyframe: Pose, frame: Pose, rng: np.random.Generator, xy: np.ndar
     there = apply(homography(keyframe, frame), xy) + rng.normal(0.0, SIGMA_NORM, xy.shape)
     pairs = [(a, b, c, d) for a, b, c, d in np.hstack([xy, there]).tolist()]
     return {"two_view": pairs, "sigma_norm": SIGMA_NORM, "inliers": len(pairs), "tracked": len(pairs)}
+
+
+def odometry(
+    t_ns: int,
+    ids: tuple[int, int],
+    poses: tuple[Pose, Pose],
+    rng: np.random.Generator,
+    *,
+    becomes_keyframe: bool = False,
+    xy: np.ndarray | None = None,
+) -> Odometry:
+    """An accepted one. ``ids``, ``poses``: of the keyframe and of the frame; ``xy`` as in ``seen_from``."""
+    keyframe_id, frame_id = ids
+    seen = seen_from(*poses, rng, xy)
+    return msgspec.structs.replace(
+        first_odometry(t_ns, frame_id), keyframe_id=keyframe_id, becomes_keyframe=becomes_keyframe, **seen
+    )
 
 
 def first_odometry(t_ns: int, frame_id: int = 0, fragment_id: int = 0) -> Odometry:

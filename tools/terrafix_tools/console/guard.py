@@ -30,10 +30,6 @@ SECURITY_HEADERS = {
 }
 
 
-class BodyTooLarge(Exception):
-    pass
-
-
 class Guard:
     """ASGI middleware. ``hosts``: accepted names in the Host header, against names of other sites that resolve to this
     computer; empty: any (tokens are asked for)."""

@@ -7,10 +7,20 @@ import numpy as np
 import pytest
 
 from map_matches import position_of, with_pose
-from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m
+from simulated_flight import (
+    ORIGIN,
+    EstimatorRun,
+    Flight,
+    altered,
+    cov_of,
+    error_m,
+    unaltered,
+    without_fix,
+    without_sight,
+)
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_from_quat, yaw_of
-from terrafix.messages import MapMatch, Odometry, Prediction, VehicleState, Verdict
+from terrafix.messages import MapMatch, Message, Prediction, VehicleState, Verdict
 
 FIRST_MATCH = 27
 TURN = 30  # frame at which it turns
@@ -19,13 +29,14 @@ TURN = 30  # frame at which it turns
 def flown(knows: set[str], *, seed: int, coarse: bool = False) -> tuple[Flight, EstimatorRun]:
     """Until 15 s after the first match; with ``coarse`` that match has no pose."""
     flight, listener = Flight(FIRST_MATCH + 30, seed=seed, telemetry=frozenset(knows)), EstimatorRun()
-    listener.feed([ORIGIN])
-    for i in range(flight.frames):
-        messages = [m for m in flight.messages(i) if not (isinstance(m, MapMatch) and i < FIRST_MATCH)]
-        if coarse and i == FIRST_MATCH:
-            messages = [with_pose(m, position_only=True) if isinstance(m, MapMatch) else m for m in messages]
-        listener.feed(messages)
-    return flight, listener
+    listener.fly(flight, 0, FIRST_MATCH, without_fix)
+    listener.fly(
+        flight,
+        FIRST_MATCH,
+        FIRST_MATCH + 1,
+        lambda m: with_pose(m, position_only=True) if coarse and isinstance(m, MapMatch) else m,
+    )
+    return flight, listener.fly(flight, FIRST_MATCH + 1, flight.frames)
 
 
 def headings_rad(listener: EstimatorRun) -> dict[int, float]:
@@ -75,16 +86,14 @@ def broken(seed: int, frames: int, turns_deg: float = 90.0, reported_from: int =
     listener = EstimatorRun()
     listener.feed([ORIGIN])
     for i in range(flight.frames):
-        messages = [m for m in flight.messages(i) if not (isinstance(m, MapMatch) and TURN <= i < TURN + 30)]
-        if TURN <= i < TURN + frames:
-            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
-        untold = [m if i >= reported_from or not isinstance(m, VehicleState) else without_heading(m) for m in messages]
-        listener.feed(untold)
+        alter = without_sight if TURN <= i < TURN + frames else without_fix if TURN <= i < TURN + 30 else unaltered
+        messages = altered(flight.messages(i), alter)
+        listener.feed(messages if i >= reported_from else map(without_heading, messages))
     return flight, listener
 
 
-def without_heading(state: VehicleState) -> VehicleState:
-    return msgspec.structs.replace(state, yaw_rad=None)
+def without_heading(message: Message) -> Message:
+    return msgspec.structs.replace(message, yaw_rad=None) if isinstance(message, VehicleState) else message
 
 
 def distances2(flight: Flight, listener: EstimatorRun) -> list[float]:
@@ -116,12 +125,10 @@ def test_the_yaw_sigma_grows_with_the_time_without_odometry() -> None:
 
 def test_a_pose_during_a_blackout_fixes_the_yaw_until_the_next_frame_without_odometry() -> None:
     flight, listener = Flight(TURN + 4, seed=1, telemetry=frozenset({"height"})), EstimatorRun()
-    listener.feed([ORIGIN])
-    for i in range(flight.frames):
-        messages = [m for m in flight.messages(i) if not isinstance(m, MapMatch) or i < TURN]
-        if i > TURN:
-            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
-        listener.feed([*messages, flight.fix(i)] if i == TURN + 2 else messages)
+    listener.fly(flight, 0, TURN).fly(flight, TURN, TURN + 1, without_fix)
+    listener.fly(flight, TURN + 1, TURN + 3, without_sight)
+    listener.feed([flight.fix(TURN + 2)])
+    listener.fly(flight, TURN + 3, flight.frames, without_sight)
     sigmas_rad = {m.frame_id: math.sqrt(m.cov[35]) for m in listener.published if isinstance(m, Prediction)}
     assert sigmas_rad[TURN + 2] == pytest.approx(math.radians(45.0), rel=0.2)
     assert sigmas_rad[TURN + 3] == pytest.approx(math.radians(22.5), rel=0.2)
@@ -143,12 +150,8 @@ def test_a_match_far_outside_the_gate_does_not_fix_a_free_yaw_gauge() -> None:
     far, listener = Flight(TURN + 42, seed=1, turn_rad=math.radians(90.0)), EstimatorRun()
     listener.feed([ORIGIN])
     for i in range(TURN + 4):
-        messages = [m for m in far.messages(i) if not (isinstance(m, MapMatch) and i >= TURN)]
-        if i >= TURN:
-            messages = [blind(m) if isinstance(m, Odometry) else m for m in messages]
-        if i == TURN + 3:
-            messages.append(moved(far.fix(i), 600.0))
-        listener.feed([without_heading(m) if isinstance(m, VehicleState) else m for m in messages])
+        listener.feed(map(without_heading, altered(far.messages(i), unaltered if i < TURN else without_sight)))
+    listener.feed([moved(far.fix(TURN + 3), 600.0)])
     assert listener.verdicts("map")[TURN + 3].verdict is Verdict.INNOVATION
 
 

@@ -9,7 +9,8 @@ from simulated_flight import CAMERA
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.factors.three_view import ThreeViewPose
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter, graph_shift
-from terrafix.messages import CalibrationEstimate, Camera, CovarianceMode, NavEstimate, SourceLabel
+from terrafix.messages import CalibrationEstimate, Camera
+from terrafix_lab.sim.true_messages import estimate as true_estimate
 from terrafix_tools.lens_report import lens_words
 
 UNCALIBRATED = msgspec.structs.replace(CAMERA, focal_sigma=0.1)
@@ -127,22 +128,8 @@ def test_a_principal_point_offset_moves_the_camera_horizontally() -> None:
 def test_a_restart_uses_the_position_of_the_graph_without_the_principal_point_offset() -> None:
     found = learnt(1)
     assert found.learnt is not None
-    estimate = NavEstimate(
-        t_ns=0,
-        frame_id=0,
-        lat_deg=48.0,
-        lon_deg=11.0,
-        alt_amsl_m=HEIGHT_M,
-        agl_m=HEIGHT_M,
-        velocity_enu_mps=(0.0, 0.0, 0.0),
-        velocity_sigma_mps=1.0,
-        q_w_b=(0.0, 0.7071067811865476, 0.7071067811865476, 0.0),  # level, heading north
-        cov=tuple(np.eye(6).ravel()),
-        source_label=SourceLabel.SATELLITE_ANCHORED,
-        covariance_mode=CovarianceMode.MARGINALS,
-        last_anchor_age_ms=0,
-        emitted_at_ns=0,
-    )
+    level_to_north = (0.0, 0.7071067811865476, 0.7071067811865476, 0.0)
+    estimate = true_estimate(0, 48.0, 11.0, sigmas=(1.0, 1.0, 1.0), agl_m=HEIGHT_M, q_w_b=level_to_north)
     # Image right is east, image down is south.
     shift_m = graph_shift(estimate, UNCALIBRATED, found.learnt)
     assert np.allclose(shift_m, HEIGHT_M * found.offset * (1.0, -1.0), atol=1e-6)

@@ -5,21 +5,11 @@ import numpy as np
 import pytest
 
 from recorded_flight import seen_again
-from simulated_flight import (
-    ORIGIN,
-    EstimatorRun,
-    Flight,
-    blind,
-    cov_of,
-    error_m,
-    sigma_m,
-    t_ns,
-)
+from simulated_flight import EstimatorRun, Flight, altered, blind, cov_of, error_m, sigma_m, t_ns, without_fix
 from terrafix.core.gate import GATE
 from terrafix.estimator.measurements.relocalization import GAINED, safe_fusion_measurement
 from terrafix.messages import (
     Health,
-    MapMatch,
     MeasurementVerdict,
     Message,
     Odometry,
@@ -34,16 +24,9 @@ GAP = range(60, 72)  # frames in which nothing is tracked, and after which a fra
 KEYFRAME, AGAIN = 57, 100  # the keyframe before the gap, and the frame that sees its ground again
 
 
-def without_map(messages: list[Message]) -> list[Message]:
-    return [m for m in messages if not isinstance(m, MapMatch)]
-
-
 def drifted(flight: Flight, end: int = AGAIN) -> EstimatorRun:
     """Flown up to frame ``end`` - 1, with map matches in the first frames alone."""
-    run = EstimatorRun().fly(flight, 0, MAP_UNTIL)
-    for i in range(MAP_UNTIL, end):
-        run.feed(without_map(flight.messages(i)))
-    return run
+    return EstimatorRun().fly(flight, 0, MAP_UNTIL).fly(flight, MAP_UNTIL, end, without_fix)
 
 
 def flight_of(seed: int) -> Flight:
@@ -111,7 +94,7 @@ def test_relocalisations_at_a_place_that_the_estimate_excludes_are_rejected_howe
     flight = Flight(FRAMES, seed=2, fix_every=1)
     run = EstimatorRun().fly(flight, 0, 60)
     for i in range(60, 64):
-        run.feed([*without_map(flight.messages(i)), seen_again(flight, 30, i, shown=50)])
+        run.feed([*altered(flight.messages(i), without_fix), seen_again(flight, 30, i, shown=50)])
     found = verdicts(run)
     assert [v.verdict for v in found] == [Verdict.INNOVATION] * 4
     assert all(v.test_ratio is not None and v.test_ratio > 1.0 for v in found)
@@ -137,10 +120,7 @@ def test_unknown_keyframes_and_frames_out_of_the_window_are_stale(keyframe: int,
 
 def test_without_a_known_heading_no_relocalisation_is_fused() -> None:
     flight = Flight(40, seed=1, telemetry=frozenset({"attitude", "height"}))
-    run = EstimatorRun()
-    run.feed([ORIGIN])
-    for i in range(31):
-        run.feed(without_map(flight.messages(i)))
+    run = EstimatorRun().fly(flight, 0, 31, without_fix)
     run.feed([seen_again(flight, 27, 30)])
     assert verdicts(run)[0].verdict in (Verdict.NO_PREDICTION, Verdict.STALE)
 
@@ -183,7 +163,7 @@ def fragment_after_gap(flight: Flight, end: int) -> EstimatorRun:
 
 def in_second_fragment(flight: Flight, i: int) -> list[Message]:
     messages: list[Message] = []
-    for m in without_map(flight.messages(i)):
+    for m in altered(flight.messages(i), without_fix):
         if isinstance(m, Odometry):
             if i in GAP:
                 m = blind(m)

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_flight import PLACE, EstimatorRun, Flight, error_m, sigma_m, t_ns
+from simulated_flight import PLACE, EstimatorRun, Flight, error_m, sigma_m, t_ns, without_fix
 from terrafix.core.gate import GATE
 from terrafix.core.log_lines import MessageLog
-from terrafix.messages import MapMatch, MeasurementVerdict, NavEstimate, PositionHint, Verdict
+from terrafix.messages import MeasurementVerdict, NavEstimate, PositionHint, Verdict
 
 FRAMES = 24
 
@@ -20,10 +20,7 @@ def flight() -> Flight:
 
 def flown(flight: Flight) -> EstimatorRun:
     """Without map matches: the start is known to 15 m."""
-    run = EstimatorRun().fly(flight, 0, 1)
-    for i in range(1, FRAMES):
-        run.feed([m for m in flight.messages(i) if not isinstance(m, MapMatch)])
-    return run
+    return EstimatorRun().fly(flight, 0, 1).fly(flight, 1, FRAMES, without_fix)
 
 
 def fix(flight: Flight, i: int, off_m: tuple[float, float] = (0.0, 0.0), sigma_m: float | None = 5.0) -> PositionHint:

@@ -32,6 +32,7 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
+from terrafix_lab.sim.true_messages import first_odometry
 
 RISE = float(np.sqrt(PRIOR @ ROUGHNESS_CANDIDATES**2))  # prior
 
@@ -50,8 +51,7 @@ ORIGIN = Origin(
 
 def begun(attitude: Attitude) -> Estimator:
     estimator = Estimator(ORIGIN)
-    first = Odometry(t_ns=0, frame_id=0, keyframe_id=0, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
-    estimator.feed_frame(FrameInput(0, 0.0, first, attitude))
+    estimator.feed_frame(FrameInput(0, 0.0, first_odometry(0), attitude))
     return estimator
 
 
@@ -245,8 +245,7 @@ def test_an_estimator_restarted_in_flight_has_a_wide_initial_position(
     list(node.on(ORIGIN))
     state = VehicleState(t_ns=15_000_000_000, source="x", yaw_rad=0.0, pitch_rad=0.0, roll_rad=0.0, agl_m=100.0)
     list(node.on(state))
-    seen = Odometry(t_ns=15_000_000_000, frame_id=30, keyframe_id=30, verdict=Verdict.ACCEPTED, becomes_keyframe=True)
-    (estimate,) = (m for m in node.on(seen) if isinstance(m, NavEstimate))
+    (estimate,) = (m for m in node.on(first_odometry(15_000_000_000, 30)) if isinstance(m, NavEstimate))
     assert low_m < np.sqrt(estimate.cov[0]) < high_m
 
 

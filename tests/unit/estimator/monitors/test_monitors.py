@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from map_matches import with_pose
-from simulated_flight import ORIGIN, EstimatorRun, Flight, sigma_m, t_ns
+from simulated_flight import ORIGIN, Alter, EstimatorRun, Flight, sigma_m, t_ns, without_fix
 from terrafix.core.agreement import Agreement, Cause
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
@@ -122,11 +122,12 @@ def test_a_straight_flight_tells_nothing_of_the_two_scales_of_its_images() -> No
 
 def test_a_flight_whose_images_are_squeezed_names_it_and_withdraws_the_position() -> None:
     """A copter at 12 m/s that turns by 115 degrees between 15 and 17 s."""
-    flight, run = Flight(50, seed=3, turn_rad=2.0), EstimatorRun()
-    run.feed([ORIGIN])
-    for i in range(50):
-        squeezed = [_scaled_x(m, 0.75) if isinstance(m, Odometry) else m for m in flight.messages(i)]
-        run.feed([m for m in squeezed if not isinstance(m, MapMatch)])
+    run = EstimatorRun().fly(
+        Flight(50, seed=3, turn_rad=2.0),
+        0,
+        50,
+        lambda m: _scaled_x(m, 0.75) if isinstance(m, Odometry) else without_fix(m),
+    )
     faults = [(m.quantity, m.factor) for m in run.published if isinstance(m, CalibrationFault)]
     assert ("aspect ratio", 0.75) in faults
     assert sigma_m(run.estimate(49)) >= FAULT_SIGMA_M
@@ -280,11 +281,9 @@ def test_the_path_since_the_last_match_bounds_the_error_of_a_wrong_description(
     assert monitor.path_error_m == 0.0
 
 
-def _fly(edit: object = None, frames: int = 120, **flight: object) -> tuple[EstimatorRun, list[CalibrationFault]]:
+def _fly(edit: Alter | None = None, frames: int = 120, **flight: object) -> tuple[EstimatorRun, list[CalibrationFault]]:
     listener, flown = EstimatorRun(), Flight(frames, **({"fix_every": 3, "dem": True} | flight))  # type: ignore[arg-type]
-    listener.feed([ORIGIN])
-    for i in range(frames):
-        listener.feed([edit(message) if callable(edit) else message for message in flown.messages(i)])
+    listener.fly(flown, 0, frames, edit)
     return listener, [message for message in listener.published if isinstance(message, CalibrationFault)]
 
 

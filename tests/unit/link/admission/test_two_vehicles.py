@@ -17,12 +17,14 @@ from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.config import LinkSection
 from terrafix.core.geodesy import LocalFrame, rot_w_b
+from terrafix.core.node import Node
 from terrafix.estimator.node import EstimatorNode
 from terrafix.link.edge import open_edge
 from terrafix.link.node import LinkNode
 from terrafix_lab.sim.autopilot.course import PeerState
 from terrafix_lab.sim.autopilot.peer import AutopilotPeer
-from terrafix_lab.sim.true_messages import seen_from
+from terrafix_lab.sim.true_messages import first_odometry, odometry
+from terrafix_tools.in_process import InProcessShell
 
 pytestmark = pytest.mark.real_time
 
@@ -89,20 +91,24 @@ class FlyingCamera:
         r_w_c = rot_w_b(yaw_rad(t_s), 0.0, 0.0) @ Mount.of(CAMERA).r_b_c()
         self._views.append((r_w_c, np.array([0.0, SPEED_MPS * t_s, HEIGHT_M])))
         keyframe = keyframe_of(i)
-        seen = seen_from(self._views[keyframe], self._views[i], np.random.default_rng(i), some_features())
-        odometry = m.Odometry(
-            t_ns=now_ns,
-            frame_id=i,
-            keyframe_id=keyframe,
-            verdict=m.Verdict.ACCEPTED,
-            becomes_keyframe=i % KEYFRAME_EVERY == 0,
-            fragment_id=0,
-            **(seen if i else {**seen, "two_view": []}),
-        )
+        poses, rng = (self._views[keyframe], self._views[i]), np.random.default_rng(i)
+        seen = odometry(now_ns, (keyframe, i), poses, rng, becomes_keyframe=i % KEYFRAME_EVERY == 0, xy=some_features())
+        if not i:
+            seen = first_odometry(now_ns)
         lat, lon = flying(t_s).lat_deg, flying(t_s).lon_deg
         velocity = (0.0, SPEED_MPS, 0.0)
         fix = estimate(now_ns, cov=covariance(3.0), lat_deg=lat, lon_deg=lon, velocity_enu_mps=velocity, late_ns=0)
-        return [odometry, fix]
+        return [seen, fix]
+
+
+class CameraFinder:
+    """An estimator that says nothing but which vehicle has the camera."""
+
+    def __init__(self, node: EstimatorNode) -> None:
+        self._node, self.tick = node, node.tick
+
+    def on(self, message: m.Message) -> list[m.Message]:
+        return [x for x in self._node.on(message) if isinstance(x, m.CameraVehicle)]
 
 
 @pytest.mark.slow
@@ -110,22 +116,16 @@ def test_of_two_vehicles_behind_one_router_the_one_with_the_camera_is_served() -
     router, zero_s = DatagramRouter(), time.monotonic()
     peers = {sysid: AutopilotPeer(seed=sysid, sysid=sysid) for sysid in (1, 2)}
     edge = open_edge(LinkSection(device=f"udpout:127.0.0.1:{router.port}"))
-    node, estimator, camera = LinkNode(10.0), EstimatorNode(), FlyingCamera(round(zero_s * 1e9))
-    published: list[m.Message] = [*estimator.on(msgspec.structs.replace(ORIGIN, agl_sigma_m=5.0))]
-
-    def exchange(messages: list[m.Message]) -> None:
-        """As the bus does, with the edge of the link."""
-        for message in messages:
-            published.append(message)
-            edge.on_message(message)
-            if not isinstance(message, m.Odometry):
-                exchange([*node.on(message)])
-            if not isinstance(message, (m.NavEstimate, m.GpsInput)):
-                exchange([x for x in estimator.on(message) if isinstance(x, m.CameraVehicle)])
+    camera, published = FlyingCamera(round(zero_s * 1e9)), list[m.Message]()
+    nodes: dict[str, Node] = {"link": LinkNode(10.0), "estimator": CameraFinder(EstimatorNode())}
+    shell = InProcessShell(nodes, lambda _, message: published.append(message), edges={"link": edge})
+    shell.feed(msgspec.structs.replace(ORIGIN, agl_sigma_m=5.0))
 
     def run(until_ns: int, *, decided: bool = False) -> None:
         while (now_ns := time.monotonic_ns()) < until_ns:
-            exchange([*camera.due(now_ns), *edge.poll(now_ns), *node.tick(now_ns)])
+            for message in camera.due(now_ns):
+                shell.feed(message)
+            shell.step(now_ns)
             if decided and any(isinstance(x, m.CameraVehicle) for x in published):
                 return
             time.sleep(0.002)

@@ -33,89 +33,54 @@ def _source(name: str) -> Callable[[Span], Edit]:
 # Pictures in the closed loop, while GNSS is jammed and the autopilot navigates by Terrafix: what they show, rows, edit
 IN_THE_LOOP: tuple[tuple[str, str, tuple[str, ...], Callable[[Span], Edit]], ...] = (
     (
-        "GNSS jam, frozen picture",
-        "one picture again and again, with new noise",
-        (),
-        _source("frozen picture with noise"),
-    ),
+        "GNSS jam, frozen picture", "one picture again and again, with new noise", (),
+        _source("frozen picture with noise")),
     ("GNSS jam, four stale buffers", "four pictures in turn", (), _source("four stale buffers")),
     ("GNSS jam, foreign frames", "pictures of another place that agree with each other", (), mirrored_before),
     (
-        "GNSS jam, late pictures",
-        "pictures that are a second old",
-        ("late sure over 20 m",),
-        lambda span: during(span, _source("pictures 1 s late")(span)),
-    ),
-)
+        "GNSS jam, late pictures", "pictures that are a second old", ("late sure over 20 m",),
+        lambda span: during(span, _source("pictures 1 s late")(span))),
+)  # fmt: skip
 LIES_IN_THE_LOOP = {name: edit for name, _, _, edit in IN_THE_LOOP}
 LIES: tuple[Scenario, ...] = (
     _scenario("ten foreign frames", "Ten frames in a row show another place.", TEMPORARY, plans.foreign_row()),
     _scenario(
-        "fast foreign frames",
-        "Ten frames in a row show another place, at three times the speed.",
-        TEMPORARY,
-        plans.foreign_row(pace=plans.FAST),
-    ),
+        "fast foreign frames", "Ten frames in a row show another place, at three times the speed.", TEMPORARY,
+        plans.foreign_row(pace=plans.FAST)),
     _scenario(
-        "foreign frames at the start", "The first ten frames show another place.", TEMPORARY, plans.foreign_row(at=0.0)
-    ),
+        "foreign frames at the start", "The first ten frames show another place.", TEMPORARY,
+        plans.foreign_row(at=0.0)),
     _scenario(
-        "15 % foreign frames",
-        "At random, 15 % of the frames are of another vehicle's camera.",
-        TEMPORARY,
-        plans.foreign_at_random,
-    ),
+        "15 % foreign frames", "At random, 15 % of the frames are of another vehicle's camera.", TEMPORARY,
+        plans.foreign_at_random),
     _scenario(
-        "every second frame foreign",
-        "Two cameras by turns, one of them at another place, for 30 frames.",
-        TEMPORARY,
-        plans.interleaved,
-    ),
+        "every second frame foreign", "Two cameras by turns, one of them at another place, for 30 frames.", TEMPORARY,
+        plans.interleaved),
     _scenario(
-        "elsewhere in reverse",
-        "Ten frames of another part of the map, in reverse order.",
-        TEMPORARY,
-        plans.elsewhere_reversed,
-    ),
+        "elsewhere in reverse", "Ten frames of another part of the map, in reverse order.", TEMPORARY,
+        plans.elsewhere_reversed),
     _scenario(
-        "another town's map",
-        "The map is of another town; the start claims 50 m.",
-        PERMANENT,
-        plans.with_map("the map is of another town", plans.other_town, start_sigma(START_SIGMA_M)),
-    ),
+        "another town's map", "The map is of another town; the start claims 50 m.", PERMANENT,
+        plans.with_map("the map is of another town", plans.other_town, start_sigma(START_SIGMA_M))),
     _scenario(
-        "another town's map, no start",
-        "The map is of another town, and no start is known.",
-        PERMANENT,
-        plans.with_map("the map is of another town", plans.other_town, start_unknown),
-    ),
+        "another town's map, no start", "The map is of another town, and no start is known.", PERMANENT,
+        plans.with_map("the map is of another town", plans.other_town, start_unknown)),
     _scenario(
-        "map shifted by 300 m",
-        "The coordinates of the map are off by 300 m.",
-        PERMANENT,
-        plans.with_map("the map is shifted", partial(plans.shifted_map, MAP_SHIFT_M)),
-    ),
+        "map shifted by 300 m", "The coordinates of the map are off by 300 m.", PERMANENT,
+        plans.with_map("the map is shifted", partial(plans.shifted_map, MAP_SHIFT_M))),
     _scenario(
-        "map in another datum",
-        "The coordinates of the map are off by 128 m.",
-        PERMANENT,
-        plans.with_map("the map is shifted", partial(plans.shifted_map, SMALL_SHIFT_M)),
-    ),
+        "map in another datum", "The coordinates of the map are off by 128 m.", PERMANENT,
+        plans.with_map("the map is shifted", partial(plans.shifted_map, SMALL_SHIFT_M))),
     _scenario(
-        "map 10 % too large", "The scale of the map is wrong.", PERMANENT, plans.with_map("too large", plans.grown_map)
-    ),
+        "map 10 % too large", "The scale of the map is wrong.", PERMANENT,
+        plans.with_map("too large", plans.grown_map)),
     _scenario("start 300 m off", "The start is 300 m off and claims 50 m.", TEMPORARY, plans.start_off),
     *(scenario_of(fault, ROWS.get(fault.name)) for fault in (*FALSE_INPUTS, *SCARCE_INPUTS)),
     _scenario(
-        "photos every 155 m",
-        "Photos that share little ground, and nothing between them.",
-        SCARCE,
-        plans.sparse_photos,
-        frames=400,
-    ),
+        "photos every 155 m", "Photos that share little ground, and nothing between them.", SCARCE,
+        plans.sparse_photos, frames=400),
     _scenario(
-        "gap of minutes", "No frame and no telemetry for three minutes.", (*SCARCE, "recovery"), plans.gap_of_minutes
-    ),
+        "gap of minutes", "No frame and no telemetry for three minutes.", (*SCARCE, "recovery"), plans.gap_of_minutes),
     *(
         Scenario(
             name,
@@ -127,4 +92,4 @@ LIES: tuple[Scenario, ...] = (
         )
         for name, text, more, _ in IN_THE_LOOP
     ),
-)
+)  # fmt: skip

@@ -24,6 +24,7 @@ from terrafix.core.pose import exp_so3, log_so3
 from terrafix.smoother.sim3_pose_graph import merge
 from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, Submap
 from terrafix_lab.bench.growth import merging_baseline
+from terrafix_lab.sim.vehicle.level import level_path
 
 RESULT = "merging.json"
 SUBMAPS, ANCHOR_EVERY, WRONG_SHARE, WRONG_M = 10, 10, 0.05, 350.0
@@ -87,9 +88,7 @@ def _course(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
     phase = rng.uniform(0.0, 2.0 * np.pi, 3)
     t = np.arange(n)
     yaw = np.cumsum(0.03 * np.sin(t / 23.0 + phase[0]) + 0.02 * np.sin(t / 61.0 + phase[1]))
-    steps = STEP_M * np.column_stack([np.sin(yaw), np.cos(yaw), np.zeros(n)])
-    p = np.cumsum(steps, axis=0)
-    p[:, 2] = AGL_M + 10.0 * np.sin(t / 40.0 + phase[2])
+    p = np.column_stack([level_path(yaw, STEP_M, (0.0, 0.0)), AGL_M + 10.0 * np.sin(t / 40.0 + phase[2])])
     mount = Mount().r_b_c()
     r = np.array([rot_w_b(float(y), 0.04 * np.sin(i / 3.0), 0.05 * np.sin(i / 5.0)) @ mount for i, y in enumerate(yaw)])
     return r, p

@@ -4,7 +4,6 @@ without wind and relief, 2 frames a second, a map match at every second one. The
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 
 from terrafix.messages import MapMatch, Message, Odometry, Origin
@@ -13,7 +12,7 @@ from terrafix_lab.montecarlo.flown import SimulatedFlight, fly
 from terrafix_lab.montecarlo.ground import Terrain
 from terrafix_lab.montecarlo.plan import plan
 from terrafix_lab.sim.autopilot.parameters import Kind
-from terrafix_lab.sim.true_messages import first_odometry, map_match, seen_from
+from terrafix_lab.sim.true_messages import first_odometry, map_match, odometry
 from terrafix_lab.sim.vehicle.wind import Wind
 
 FRAME_S, SPEED_MPS, HEIGHT_M = 0.5, 12.0, 100.0
@@ -56,11 +55,10 @@ def frame_messages(frames: int) -> Iterator[FrameMessages]:
     keyframe, keyframe_pose = 0, (flown.frames[0].r_w_c, flown.frames[0].p_m)
     for i, shot in enumerate(flown.frames[:frames]):
         t_ns, pose = round(1e9 * shot.t_s), (shot.r_w_c, shot.p_m)
-        odometry = first_odometry(t_ns)
+        seen = first_odometry(t_ns)
         if i:
             due = i % KEYFRAME_EVERY == 0
-            seen = seen_from(keyframe_pose, pose, rng)
-            odometry = msgspec.structs.replace(odometry, frame_id=i, keyframe_id=keyframe, becomes_keyframe=due, **seen)
+            seen = odometry(t_ns, (keyframe, i), (keyframe_pose, pose), rng, becomes_keyframe=due)
             keyframe, keyframe_pose = (i, pose) if due else (keyframe, keyframe_pose)
         match = map_match(t_ns, i, pose, rng) if i % FIX_EVERY == 0 else None
-        yield FrameMessages(flown.telemetry[i], odometry, match, shot.p_m)
+        yield FrameMessages(flown.telemetry[i], seen, match, shot.p_m)

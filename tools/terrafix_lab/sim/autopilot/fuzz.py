@@ -19,7 +19,7 @@ from terrafix.core.config import LinkSection
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.integrity.output_predictor import distance_m, offset
 from terrafix.link.node import TICK_HZ, LinkNode
-from terrafix.messages import CovarianceMode, GpsInput, Message, NavEstimate, SourceLabel, VehicleState
+from terrafix.messages import GpsInput, Message, NavEstimate, VehicleState
 from terrafix_lab.sim.autopilot.fuzz_wire import (
     KEY,
     MS,
@@ -34,11 +34,12 @@ from terrafix_lab.sim.autopilot.fuzz_wire import (
     transmit,
 )
 from terrafix_lab.sim.closed_loop.loopback import Loopback
+from terrafix_lab.sim.true_messages import estimate
 from terrafix_tools.in_process import InProcessShell
 
 S = 1_000_000_000
 STEP_NS = round(S / TICK_HZ)
-LAT, LON, ALT_M, EAST_MPS = 48.0, 11.0, 620.0, 20.0
+LAT, LON, EAST_MPS = 48.0, 11.0, 20.0
 
 
 @dataclass
@@ -104,23 +105,8 @@ def fuzz(wire: BadWire, seconds: float, *, seed: int = 1, signed: bool = False) 
 
 def _estimate(t_ns: int, emitted_ns: int) -> NavEstimate:
     lat, lon = offset(LAT, LON, EAST_MPS * t_ns / S, 0.0)
-    cov = [0.0] * 36
-    cov[0] = cov[7] = cov[14] = 9.0
-    return NavEstimate(
-        t_ns=t_ns,
-        frame_id=t_ns // MS,
-        lat_deg=lat,
-        lon_deg=lon,
-        alt_amsl_m=ALT_M,
-        agl_m=120.0,
-        velocity_enu_mps=(EAST_MPS, 0.0, 0.0),
-        velocity_sigma_mps=0.5,
-        q_w_b=(1.0, 0.0, 0.0, 0.0),
-        cov=tuple(cov),
-        source_label=SourceLabel.SATELLITE_ANCHORED,
-        covariance_mode=CovarianceMode.MARGINALS,
-        last_anchor_age_ms=0,
-        emitted_at_ns=emitted_ns,
+    return estimate(
+        t_ns, lat, lon, sigmas=(3.0, 3.0, 0.0), velocity_enu_mps=(EAST_MPS, 0.0, 0.0), emitted_at_ns=emitted_ns
     )
 
 

@@ -157,7 +157,7 @@ def flight_over(
     )
     log = TelemetryLog(autopilot, T0_US)
     until = (lambda: False) if duration_s is not None else (lambda: vehicle.finished)
-    path = fly(vehicle, sensors, first, (duration_s or MAX_DURATION_S) + EXTRA_S, until=until, on_reading=log.step)
+    path = fly(vehicle, sensors, (duration_s or MAX_DURATION_S) + EXTRA_S, until=until, on_reading=log.step)
     if vehicle.crashed:
         raise SourceError(
             f"{mission.name}: the vehicle flew into the ground after {vehicle.state.t_s:.0f} s; raise the heights, or "

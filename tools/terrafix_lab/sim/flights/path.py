@@ -1,11 +1,11 @@
 """True path of a flown flight: states per step, with interpolation."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from terrafix_lab.sim.interfaces import Readings, Sensors, State, Vehicle
+from terrafix_lab.sim.interfaces import Navigation, Readings, Sensors, State, Vehicle
 
 STEP_S = 0.02  # of the simulation
 
@@ -32,23 +32,29 @@ class FlownPath:
         return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
 
+def states_of(
+    vehicle: Vehicle, count: int, navigation: Callable[[State], Navigation | None] = lambda _: None
+) -> Iterator[State]:
+    """-> ``count`` true states, STEP_S apart, of which the first is that of now. ``navigation``: by which the vehicle
+    steers, of the state before; None: by the truth."""
+    for i in range(count):
+        yield vehicle.step(STEP_S, navigation(vehicle.state)) if i else vehicle.state
+
+
 def fly(
     vehicle: Vehicle,
     sensors: Sensors,
-    first: State,
     duration_s: float,
     *,
     until: Callable[[], bool] = lambda: False,
     on_reading: Callable[[Readings], None],
 ) -> FlownPath:
-    """Flies for ``duration_s`` from ``first``, steering by the truth; ``until`` ends it earlier. ``on_reading`` is
-    called with every reading.
-    """
-    states = [first]
-    on_reading(sensors.read(first))
-    for _ in range(math.ceil(duration_s / STEP_S)):
-        states.append(vehicle.step(STEP_S, None))
-        on_reading(sensors.read(states[-1]))
+    """Flies for ``duration_s``, steering by the truth; ``until`` ends it earlier. ``on_reading`` is called with every
+    reading."""
+    states = []
+    for state in states_of(vehicle, math.ceil(duration_s / STEP_S) + 1):
+        states.append(state)
+        on_reading(sensors.read(state))
         if until():
             break
     return FlownPath(states)

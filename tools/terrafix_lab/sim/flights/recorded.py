@@ -122,7 +122,7 @@ def fly_recorded(recorded: Recorded, *, seed: int) -> tuple[FlownPath, Telemetry
         boot_ns=Clock.of(seed).boot_ns,
     )
     log = TelemetryLog(autopilot, T0_US)
-    return fly(vehicle, sensors, vehicle.state, duration_s, on_reading=log.step), log
+    return fly(vehicle, sensors, duration_s, on_reading=log.step), log
 
 
 def write_recorded(flight: Path, out: Path, *, seed: int) -> Recorded:

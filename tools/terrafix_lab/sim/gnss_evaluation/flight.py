@@ -7,7 +7,9 @@ for a while.
 
 import math
 import random
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import count, islice
 
 import numpy as np
 
@@ -15,11 +17,9 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.link.gnss.map_registration import MapOffsetEstimator
 from terrafix.link.node import LinkNode
 from terrafix.messages import (
-    CovarianceMode,
     GnssReading,
     GnssState,
     GnssVerdict,
-    GpsInput,
     Message,
     NavEstimate,
     SourceLabel,
@@ -28,13 +28,14 @@ from terrafix.messages import (
 from terrafix_lab.sim.interfaces import GnssFix, State
 from terrafix_lab.sim.sensors.gnss import DELAY_S, Gnss
 from terrafix_lab.sim.sensors.gnss_events import AnyEvent
+from terrafix_lab.sim.true_messages import estimate
+from terrafix_lab.sim.vehicle.level import level_state
 from terrafix_tools.in_process import InProcessShell
 
 STEP_S = 0.2  # period of receiver readings, attitude and the link's tick
 ESTIMATES_S = 0.4
 ESTIMATE_DELAY_S = 0.3
 NS_PER_S = 1_000_000_000
-GRAVITY_MPS2 = 9.81
 FRAME = LocalFrame(48.0, 11.0)
 ALT_M = 620.0
 
@@ -53,32 +54,28 @@ class Vision:
 
 @dataclass
 class DetectorResult:
-    """The detector's states with their times in s, and the sent positions."""
+    """The detector's states with their times in s."""
 
     states: list[tuple[float, GnssState]] = field(default_factory=list)
     lost_fix_s: float | None = None  # time at which the receiver's own fix was lost
-    # Sent positions, once a second: time [s], error east and north [m], stated 1-sigma [m]
-    sent: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def first(self, after_s: float, *wanted: GnssState) -> float | None:
         return next((t for t, state in self.states if t >= after_s and state in wanted), None)
 
 
-def fly(
-    duration_s: float, vision: Vision, events: tuple[AnyEvent, ...], seed: int, *, map_offset: bool = True
-) -> DetectorResult:
-    """Simulates one flight. ``map_offset``: the map's offset is estimated from the receiver."""
+def fly(duration_s: float, vision: Vision, events: tuple[AnyEvent, ...], seed: int) -> DetectorResult:
+    """Simulates one flight."""
     rng = random.Random(f"{seed} judge")
     gnss = Gnss(FRAME, seed=seed, events=events)
-    node, outputs = LinkNode(10.0, map_offsets=MapOffsetEstimator() if map_offset else None), list[Message]()
+    node, outputs = LinkNode(10.0, map_offsets=MapOffsetEstimator()), list[Message]()
     shell = InProcessShell({"link": node}, lambda _, message: outputs.append(message))
-    trajectory, estimator, result = _Trajectory(rng), _Estimator(vision, rng), DetectorResult()
+    course = _course(rng.uniform(12.0, 28.0), rng.uniform(-math.pi, math.pi), rng)
+    estimator, result = _Estimator(vision, rng), DetectorResult()
     pending: list[tuple[float, NavEstimate]] = []
     previous_state: GnssState | None = None
     event_start_s = min((event.start_s for event in events), default=math.inf)
-    for step in range(round(duration_s / STEP_S)):
-        t_s = step * STEP_S
-        state = trajectory.step(t_s)
+    for step, state in enumerate(islice(course, round(duration_s / STEP_S))):
+        t_s = state.t_s
         fix = gnss.read(state)  # 0.2 s old, by the step; the detector assumes an age of 0.15 s
         if fix is not None and fix.fix_type < 3 and result.lost_fix_s is None and t_s >= event_start_s:
             result.lost_fix_s = t_s - DELAY_S
@@ -96,35 +93,22 @@ def fly(
             if isinstance(message, GnssVerdict) and message.state is not previous_state:
                 previous_state = message.state
                 result.states.append((t_s, message.state))
-            elif isinstance(message, GpsInput) and message.fix_type >= 3 and step % round(1.0 / STEP_S) == 0:
-                e, n = FRAME.to_local(message.lat_deg, message.lon_deg)
-                off = np.array([e, n]) - state.p_b_in_w_m[:2]
-                result.sent.append((t_s, float(off[0]), float(off[1]), message.horiz_accuracy_m))
     return result
 
 
-class _Trajectory:
-    """Straight legs and turns at constant speed."""
-
-    def __init__(self, rng: random.Random) -> None:
-        self._rng = rng
-        self._speed = rng.uniform(12.0, 28.0)
-        self._yaw = rng.uniform(-math.pi, math.pi)
-        self._p = np.array([0.0, 0.0, ALT_M])
-        self._rate, self._until_s = 0.0, 0.0
-
-    def step(self, t_s: float) -> State:
-        if t_s >= self._until_s:
-            turning = self._rate == 0.0 and t_s > 0
-            self._rate = self._rng.choice((-1, 1)) * self._rng.uniform(0.05, 0.25) if turning else 0.0
-            self._until_s = t_s + (self._rng.uniform(4.0, 14.0) if turning else self._rng.uniform(20.0, 120.0))
-        v = self._speed * np.array([math.sin(self._yaw), math.cos(self._yaw), 0.0])
-        roll = math.atan2(self._speed * self._rate, GRAVITY_MPS2)
-        zero = np.zeros(3)
-        state = State(t_s, self._p.copy(), v, self._yaw, 0.0, roll, 120.0, zero, zero, self._speed)
-        self._p += v * STEP_S
-        self._yaw = math.remainder(self._yaw + self._rate * STEP_S, math.tau)
-        return state
+def _course(speed_mps: float, yaw_rad: float, rng: random.Random) -> Iterator[State]:
+    """Straight legs and turns at constant speed, a state every STEP_S."""
+    p_m, rate_radps, until_s = np.array([0.0, 0.0, ALT_M]), 0.0, 0.0
+    for step in count():
+        t_s = step * STEP_S
+        if t_s >= until_s:
+            turning = rate_radps == 0.0 and t_s > 0
+            rate_radps = rng.choice((-1, 1)) * rng.uniform(0.05, 0.25) if turning else 0.0
+            until_s = t_s + (rng.uniform(4.0, 14.0) if turning else rng.uniform(20.0, 120.0))
+        state = level_state(t_s, p_m, speed_mps, yaw_rad, rate_radps)
+        yield state
+        p_m = p_m + state.velocity_enu_mps * STEP_S
+        yaw_rad = math.remainder(yaw_rad + rate_radps * STEP_S, math.tau)
 
 
 class _Estimator:
@@ -145,24 +129,17 @@ class _Estimator:
         e, n = state.p_b_in_w_m[:2] + self._constant + self._wander + self._drift_mps * gap_s
         lat, lon = FRAME.to_wgs84(float(e), float(n))
         t_ns = round(state.t_s * NS_PER_S)
-        cov = [0.0] * 36
-        cov[0] = cov[7] = self._vision.sigma_m**2 + (self._vision.gap_mps * gap_s) ** 2
-        cov[14] = 9.0
         ve, vn = state.velocity_enu_mps[:2] + self._velocity
-        return NavEstimate(
-            t_ns=t_ns,
-            frame_id=t_ns,
-            lat_deg=lat,
-            lon_deg=lon,
-            alt_amsl_m=ALT_M,
-            agl_m=120.0,
+        sigma_m = math.hypot(self._vision.sigma_m, self._vision.gap_mps * gap_s)
+        return estimate(
+            t_ns,
+            lat,
+            lon,
+            sigmas=(sigma_m, 3.0, 0.0),
             velocity_enu_mps=(float(ve), float(vn), 0.0),
             velocity_sigma_mps=self._vision.velocity_sigma_mps,
-            q_w_b=(1.0, 0.0, 0.0, 0.0),
-            cov=tuple(cov),
             map_sigma_m=self._vision.sigma_m * math.sqrt(self._vision.constant_share),
             source_label=SourceLabel.DEAD_RECKONED if gap_s else SourceLabel.SATELLITE_ANCHORED,
-            covariance_mode=CovarianceMode.MARGINALS,
             last_anchor_age_ms=round(gap_s * 1000),
             emitted_at_ns=t_ns + round(ESTIMATE_DELAY_S * NS_PER_S),
         )
