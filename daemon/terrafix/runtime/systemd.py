@@ -78,7 +78,7 @@ class JournalStream:
         with contextlib.suppress(OSError):
             self._send(
                 message,
-                SYSLOG_PRIORITY=SYSLOG_PRIORITY.get(level, SYSLOG_PRIORITY["info"]),
+                PRIORITY=SYSLOG_PRIORITY.get(level, SYSLOG_PRIORITY["info"]),
                 SYSLOG_IDENTIFIER=IDENTIFIER,
                 TERRAFIX_EVENT=event,
                 TERRAFIX_TIME=str(time),
