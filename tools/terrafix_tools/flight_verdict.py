@@ -52,6 +52,11 @@ class FlightVerdict:
             return "do not trust it"
         return "trust it" if self.share == 1.0 else "trust it in part"
 
+    @property
+    def is_trusted(self) -> bool:
+        """All of the flight is."""
+        return bool(self.spans) and self.share == 1.0
+
     def since(self, zero_s: float) -> "FlightVerdict":
         """The same with times since ``zero_s``."""
         spans = [(a - zero_s, b - zero_s) for a, b in self.spans]

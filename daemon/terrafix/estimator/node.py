@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
@@ -44,6 +45,7 @@ from terrafix.estimator.pose_estimator import (
 )
 from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpoint
 from terrafix.estimator.propagation import PropagationResult
+from terrafix.estimator.rolling_shutter import RollingShutter
 from terrafix.estimator.smoother_inputs import map_anchor, odometry_link, relocalization_link
 from terrafix.messages import (
     CalibrationFault,
@@ -108,6 +110,7 @@ class EstimatorNode:
         sent_ns = None if checkpoint is None else checkpoint.estimate.t_ns
         self._ahrs = AhrsCorrectionMonitor(self._telemetry, sent_ns)
         self._attitude: Attitude | None = None  # at the newest frame
+        self._shutter: RollingShutter | None = None  # of the camera of the Origin
         self._early_dead_reckoning: list[
             EkfDeadReckoning
         ] = []  # before the Origin: the link may run before vision does
@@ -180,7 +183,7 @@ class EstimatorNode:
         self._telemetry.gimbal.describe(origin.camera)
         self._predicted_id = None  # in other axes
         prior = self._prior(origin, self._axes)
-        offset = TimeOffset(Mount.of(origin.camera).r_b_c())
+        offset, self._shutter = TimeOffset(Mount.of(origin.camera).r_b_c()), RollingShutter(origin.camera)
         self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior), offset)
         waiting, self._early_dead_reckoning = self._early_dead_reckoning, []
         for sample in waiting:
@@ -316,7 +319,7 @@ class EstimatorNode:
     def _frame(self, odometry: Odometry) -> Iterable[Message]:
         if self._estimator is None or self._flight is None:
             return
-        stamped, time_offset = odometry, self._flight.time_offset
+        stamped_ns, time_offset = odometry.t_ns, self._flight.time_offset
         if (camera_vehicle := self._camera_vehicle.on_odometry(odometry, self._estimator.origin.camera)) is not None:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
@@ -356,8 +359,8 @@ class EstimatorNode:
                 time_offset.forget_images()
             else:
                 if jump is not None and jump[0] == frame.t_s:
-                    self._time_contradicted(stamped.t_ns, jump[1], result.placed, by_map=False)
-                time_offset.add(stamped, self._telemetry, agl_m)
+                    self._time_contradicted(stamped_ns, jump[1], result.placed, by_map=False)
+                time_offset.add(msgspec.structs.replace(odometry, t_ns=stamped_ns), self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
         yield from self._refused_pictures(odometry.t_ns, result.verdict, estimator.state, frame.attitude)
         yield from self._start_fault(estimator, odometry.t_ns)
@@ -419,6 +422,8 @@ class EstimatorNode:
         imu = self._ahrs.world_acceleration
         if not attitude.sees_ground:
             odometry = without_ground(odometry)
+        elif self._shutter is not None:
+            odometry = self._shutter.corrected(odometry, estimator.state, attitude, self._telemetry)
         estimator.state.on_gimbal = self._telemetry.gimbal.used
         return estimator, FrameInput(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, imu)
 
@@ -456,7 +461,8 @@ class EstimatorNode:
             step_m = np.asarray(frame.pose.translation()[:2]) - self._predicted_m
             step_var_m2 += max(float(np.linalg.eigvalsh(cov[:2, :2] - self._predicted_m2)[-1]), 0.0)
         prior_t_ns = 0 if self._initial is None else self._initial.t_ns
-        return prediction_of(estimator, frame, t_ns, step_m, step_var_m2, prior_t_ns)
+        motion = UNSET if self._shutter is None else self._shutter.motion
+        return prediction_of(estimator, frame, t_ns, step_m, step_var_m2, prior_t_ns, motion)
 
     def _is_slow_due(self, frame: FrameState, estimator: Estimator) -> bool:
         """Whether CalibrationEstimate and ClaimBudget are published with this frame: once a second, not before a map
@@ -485,7 +491,7 @@ class EstimatorNode:
             return
         if not self._relocated:
             self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
-        result = estimator.feed_relocalization(seen)
+        result = estimator.feed_relocalization(seen if self._shutter is None else self._shutter.relocalized(seen))
         fusion = result.fusion
         fragment = estimator.state.fragment_of(seen.frame_id)
         for verdict in (fusion, *self._rebuild_verdicts(estimator)):

@@ -27,7 +27,7 @@ from terrafix.messages import CovarianceMode, Odometry, Verdict
 
 # Verdicts on frames without a new view of the ground.
 NO_NEW_VIEW = (Verdict.BAD_IMAGE, Verdict.OVERTAKEN, Verdict.STALLED, Verdict.NO_GROUND)
-MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
+MAX_ODOMETRY_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
 HEADING_GATE = 3.0  # sigmas between the turn of a new fragment and the reported heading [tuned]
 
 
@@ -259,7 +259,7 @@ class OdometryMeasurement:
         if isinstance(motion, Verdict):
             return motion
         dt_s = max(odometry.t_ns * 1e-9 - state.graph.time_of(parent), 1e-3)
-        possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + view.height_m
+        possible = float(np.linalg.norm(motion.p_m)) <= MAX_ODOMETRY_SPEED_MPS * dt_s + view.height_m
         return KeyframeMotion(parent, motion, odometry) if possible else Verdict.IMPLAUSIBLE
 
     def _expected_rotation(self, frame: FrameInput, keyframe: NodeState) -> tuple[np.ndarray, float]:

@@ -8,7 +8,7 @@ from collections import Counter
 from terrafix.messages import CalibrationFault, Verdict
 
 FROZEN, OTHER, EMPTY = "picture frozen", "picture contradicts motion", "picture without texture"
-KINDS = {
+INPUT_KINDS = {
     Verdict.STALLED: FROZEN,
     Verdict.IMPLAUSIBLE: OTHER,  # it agrees with itself, and not with this flight
     Verdict.UNCONFIRMED: OTHER,
@@ -23,7 +23,7 @@ DETAILS = {
 }
 # ns and frames without a used picture; used pictures in a row that end it. [spec: allowed to a wrong fix, score.py]
 AFTER_NS = 3_000_000_000
-FRAMES = 3  # [spec: positions in a row that are right again, tools/terrafix_lab/track.py]
+REFUSED_FRAMES = 3  # [spec: positions in a row of the score]
 
 
 class RefusedPictures:
@@ -36,16 +36,16 @@ class RefusedPictures:
         """``verdict``: on the odometry of a frame. -> the fault that begins or ends with it; else nothing."""
         if verdict is Verdict.ACCEPTED:
             self._refused, self._used = [], self._used + 1
-            if not self._active or self._used < FRAMES:
+            if not self._active or self._used < REFUSED_FRAMES:
                 return []
             ended, self._active = self._active, ""
             return [CalibrationFault(t_ns=t_ns, quantity=ended, factor=None, detail="pictures are used", active=False)]
-        if verdict not in KINDS:  # nothing is known of the picture
+        if verdict not in INPUT_KINDS:  # nothing is known of the picture
             return []
         self._used = 0
-        self._refused.append((t_ns, KINDS[verdict]))
+        self._refused.append((t_ns, INPUT_KINDS[verdict]))
         first_ns = self._refused[0][0]
-        if self._active or len(self._refused) < FRAMES or t_ns - first_ns < AFTER_NS:
+        if self._active or len(self._refused) < REFUSED_FRAMES or t_ns - first_ns < AFTER_NS:
             return []
         self._active = Counter(kind for _, kind in self._refused).most_common(1)[0][0]
         detail = DETAILS[self._active]

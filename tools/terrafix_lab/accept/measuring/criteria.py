@@ -57,7 +57,7 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "both estimates": ("AC-8", "frames with both, immediate and refined", "%", _least(0.80), None, of.both_estimates),
     "odometry": ("AC-9", "frames registered by odometry", "%", _least(0.95), None, of.odometry_rate),
     "odometry px": ("AC-10", "reprojection error of odometry, mean", "px", _most(1.0), None, of.odometry_px),
-    "map px": ("AC-10", "reprojection error of map matches, mean", "px", _most(2.5), None, of.map_px),
+    "map px": ("AC-10", "reprojection error of map matches, mean", "px", _most(of.MAP_FLOOR_PX), None, of.map_px),
     "drift": ("AC-11", "drift between map fixes, worst", "m", _most(100.0), _most(50.0), of.drift),
     "drift share": ("AC-11", "drift by distance, longest way without a fix", "%", None, _most(0.005), of.drift_share),
     "claims": ("AC-12", "estimates with covariance, label, mode, age of fix", "%", ALL, None, of.complete_estimates),
