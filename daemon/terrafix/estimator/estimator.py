@@ -98,6 +98,10 @@ class Estimator:
         """1-sigma error of the map of the newest accepted match; 0: there was none."""
         return self._map_update.map_sigma_m
 
+    def forget_rejected(self) -> None:
+        """What has contradicted the position is explained: the frames were of another time."""
+        self._map_update.forget_rejected()
+
     def refine(self) -> dict[int, PastPose]:
         """After landing: frame -> camera, whose position is by all that was measured in the flight; only of frames that
         a place stands behind."""

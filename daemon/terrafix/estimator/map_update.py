@@ -115,6 +115,12 @@ class MapUpdate:
         result = self._fuse(match, node, measurement)
         return self._restarted(result) if finds and result.fixed is not None else result
 
+    def forget_rejected(self) -> None:
+        """Rejected matches support no other position any more."""
+        self._rejected.clear()
+        self._state.image_jump = None
+        self.hypotheses.on_relocalized()
+
     def _update_belief(self, match: MapMatch, node: int | None) -> str:
         """Ground and belief of the newest frame. -> detail of the verdict on a match that is LOST; else empty."""
         state = self._state

@@ -405,7 +405,8 @@ class EstimatorNode:
         stamp_ns = odometry.t_ns
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         before_ns, self._stamp_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns, stamp_ns
-        time_offset.step((stamp_ns - before_ns) * 1e-9)
+        if time_offset.step((stamp_ns - before_ns) * 1e-9) and self._estimator is not None:
+            self._estimator.forget_rejected()
         if not time_offset.applied_s:
             return odometry
         return msgspec.structs.replace(odometry, t_ns=stamp_ns - round(time_offset.applied_s * 1e9))

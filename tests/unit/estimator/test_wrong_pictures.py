@@ -152,7 +152,8 @@ def test_a_frozen_picture_that_jitters_is_stalled_and_its_place_on_the_map_is_no
     assert [verdicts[i] for i in range(FIRST + 2, END)] == [Verdict.STALLED] * (END - FIRST - 2)
     predicted = {m.frame_id for m in result.published if isinstance(m, Prediction)}
     assert not predicted & set(range(FIRST + 2, END))
-    assert not [m for m in result.published if isinstance(m, CalibrationFault)]
+    faults = [(m.quantity, m.active) for m in result.published if isinstance(m, CalibrationFault)]
+    assert faults == [("picture frozen", True), ("picture frozen", False)]
     assert result.is_back(3.0)
 
 

@@ -97,7 +97,8 @@ class PositionHypotheses:
         self._start_sigma_m, self._modes, self._belief = 0.0, (), None
 
     def on_relocalized(self) -> None:
-        """A search over several frames has found the position: what matches said before does not count."""
+        """What matches said before does not count: a search over several frames has found the position, or they were
+        of another time."""
         self.use(self._agreement)
 
     def on_reset(self, anywhere_m: float) -> None:

@@ -239,10 +239,10 @@ class TimeOffset:
             remaining_s if self._far(self.applied_s) >= MIN_COMPONENT_WEIGHT else min(remaining_s, self._prior_sigma_s)
         )
 
-    def step(self, dt_s: float) -> None:
+    def step(self, dt_s: float) -> bool:
         """Moves ``applied_s`` towards the estimate where that is known and not 0, towards 0 where it is 0; elsewhere it
         stays. An offset that has jumped is subtracted at once: on the way there images would show more motion than the
-        time between them. ``dt_s``: since the last frame."""
+        time between them. ``dt_s``: since the last frame. -> whether that is so."""
         far, target_s = self._far(0.0), self.applied_s
         median_s = DRIFT_GRID_S[np.searchsorted(np.cumsum(self.density), 0.5)]
         near = np.where(np.abs(DRIFT_GRID_S - median_s) <= KNOWN_S, self.density, 0.0)
@@ -252,9 +252,10 @@ class TimeOffset:
             target_s = 0.0
         off_s = target_s - self.applied_s
         max_step_s = MAX_SLEW * max(dt_s, 0.0)
-        if self._jumps and abs(off_s) > FAR_S:
+        if jumps := self._jumps and abs(off_s) > FAR_S:
             self._jumps, max_step_s = False, abs(off_s)
         self.applied_s += float(np.clip(off_s, -max_step_s, max_step_s))
+        return jumps
 
     @property
     def is_wrong(self) -> bool:

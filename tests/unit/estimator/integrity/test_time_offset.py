@@ -260,6 +260,8 @@ def test_an_image_that_jumps_along_the_track_is_one_of_another_time_and_one_besi
     assert offset.estimate[0] == pytest.approx(late_s, abs=0.1)
     (fault,) = offset.take_changes(0) or (None,)
     assert (fault is not None and fault.active) == (late_s != 0.0)
+    assert offset.step(0.5) == (late_s != 0.0), "an offset that has jumped is subtracted at once"
+    assert offset.applied_s == pytest.approx(late_s, abs=0.1) and offset.sigma_s < 0.2 and not offset.step(0.5)
 
 
 def test_a_vehicle_that_hovers_learns_nothing_of_the_time_from_an_image_that_jumps() -> None:
