@@ -230,6 +230,7 @@ export class FlightView {
     if (this.dirty) this.draw();
     else this.glance.update(this.model);
     this.showLost();
+    this.drawThrough();
   }
 
   showLost() {
@@ -281,7 +282,7 @@ export class FlightView {
   drawThrough() {
     const {flight, isLive, request} = this.model;
     const {uploaded, processed, expected} = flight.images;
-    const open = mayAct() && !isLive && flight.state !== "completed" && !flight.completing && !uploads.has(this.flightId);
+    const open = mayAct() && !isLive && flight.state !== "completed" && !flight.completing && !uploads.get(this.flightId)?.running;
     const through = open && uploaded > 0 && processed >= uploaded && !flight.error;
     const what = !open ? "" : flight.error ? "failed" : uploaded < (expected ?? 0) ? "resume" : through && request && this.helped ? "helped" : through && !request && !expected ? "through" : "";
     if (this.waits === `${what}${uploaded}`) return;
