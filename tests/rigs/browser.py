@@ -72,7 +72,7 @@ class Browser:
         os.close(self._in)
         self._profile.cleanup()
 
-    def _call(self, method: str, limit_s: float = 60.0, **parameters: Any) -> dict[str, Any]:
+    def _call(self, method: str, limit_s: float = 180.0, **parameters: Any) -> dict[str, Any]:
         self._last += 1
         number = self._last  # answers to questions of the page may come in between
         message: dict[str, Any] = {"id": number, "method": method, "params": parameters}
