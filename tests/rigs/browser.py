@@ -15,7 +15,13 @@ from typing import Any, Self
 from terrafix_tools import child_process
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-NEW_PROFILE = ("--no-first-run", "--disable-background-networking", "--disable-sync", "--disable-component-update")
+NEW_PROFILE = (
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-sync",
+    "--disable-component-update",
+    "--disable-features=BackForwardCache",
+)
 STOP_S = 5.0
 
 
