@@ -15,7 +15,13 @@ from typing import Any, Self
 from terrafix_tools import child_process
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-NEW_PROFILE = ("--no-first-run", "--disable-background-networking", "--disable-sync", "--disable-component-update")
+NEW_PROFILE = (
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-sync",
+    "--disable-component-update",
+    "--disable-features=BackForwardCache",
+)
 STOP_S = 5.0
 
 
@@ -72,16 +78,17 @@ class Browser:
         os.close(self._in)
         self._profile.cleanup()
 
-    def _call(self, method: str, limit_s: float = 60.0, **parameters: Any) -> dict[str, Any]:
+    def _call(self, method: str, limit_s: float = 180.0, **parameters: Any) -> dict[str, Any]:
         self._last += 1
-        message: dict[str, Any] = {"id": self._last, "method": method, "params": parameters}
+        number = self._last  # answers to questions of the page may come in between
+        message: dict[str, Any] = {"id": number, "method": method, "params": parameters}
         if self._session:
             message["sessionId"] = self._session
         os.write(self._out, json.dumps(message).encode() + b"\0")
         end_s = time.monotonic() + limit_s
         while True:
             answer = self._receive(end_s, method)
-            if answer.get("id") == self._last:
+            if answer.get("id") == number:
                 if "error" in answer:
                     raise PageError(f"{method}: {answer['error']}")
                 return answer["result"]

@@ -17,7 +17,7 @@ export class AskView {
   constructor(flight, request, info, heading) {
     Object.assign(this, {flight, request, info, heading, pixel: null, place: null, small: []});
     this.frame = new FrameView((at) => { this.pixel = at; this.update(); });
-    this.mapBox = h("div", {class: "ask-map", "aria-label": t("map")});
+    this.mapBox = h("div", {class: "ask-map", role: "application", "aria-label": t("map")});
     this.line = h("p", {class: "ask-line", role: "status"});
     this.send = h("button", {class: "primary", onclick: () => this.fix()}, t("send_fix"));
     this.radius = h("input", {type: "number", id: "hint-radius", min: 100, max: 100000, step: 100, value: HINT_M});

@@ -61,7 +61,7 @@ export class FlightView {
     this.asking = h("div", {class: "banner ask-banner", role: "alert", hidden: true});
     this.problem = h("p", {class: "banner failed", role: "alert", hidden: true});
     this.through = h("div", {class: "banner through", role: "status", hidden: true});
-    this.mapBox = h("div", {class: "map", "aria-label": t("map_help")});
+    this.mapBox = h("div", {class: "map", role: "application", "aria-label": t("map_help")});
     const main = h("div", {class: "flight"}, this.lost, this.problem, this.asking, this.through, this.glance.element,
       h("div", {class: "stage"}, this.mapBox, this.tools(), this.legend(), this.info ? null : h("p", {class: "no-map"}, t("no_such_map", this.model.flight.map.name))),
       h("aside", {class: "side", "aria-label": t("details")}, this.frameCard(), this.uploadSlot = h("div", {}), this.tabs()));
@@ -227,9 +227,11 @@ export class FlightView {
       } catch { this.wantsRefresh = true; }
       if (this.closed) return;
     }
-    if (this.dirty) this.draw();
+    const uploading = Boolean(uploads.get(this.flightId)?.running);
+    if (this.dirty || uploading !== this.uploading) this.draw();
     else this.glance.update(this.model);
     this.showLost();
+    this.drawThrough();
   }
 
   showLost() {
@@ -242,6 +244,7 @@ export class FlightView {
 
   draw() {
     this.dirty = false;
+    this.uploading = Boolean(uploads.get(this.flightId)?.running);
     const {model} = this;
     const {flight} = model;
     fill(this.middle, h("strong", {class: "flight-name"}, flight.name || flight.flight_id), stateBadge(flight),
@@ -258,7 +261,7 @@ export class FlightView {
     if (this.more) {
       const open = !model.isLive && flight.state !== "completed";
       this.moreLabel.hidden = this.more.disabled = this.completeButton.hidden = !open;
-      this.more.disabled = !open || uploads.has(this.flightId);
+      this.more.disabled = !open || this.uploading;
       this.completeButton.hidden = !open || flight.completing;
       this.askButton.hidden = flight.state === "completed" || !model.newest;
     }
@@ -281,7 +284,7 @@ export class FlightView {
   drawThrough() {
     const {flight, isLive, request} = this.model;
     const {uploaded, processed, expected} = flight.images;
-    const open = mayAct() && !isLive && flight.state !== "completed" && !flight.completing && !uploads.has(this.flightId);
+    const open = mayAct() && !isLive && flight.state !== "completed" && !flight.completing && !this.uploading;
     const through = open && uploaded > 0 && processed >= uploaded && !flight.error;
     const what = !open ? "" : flight.error ? "failed" : uploaded < (expected ?? 0) ? "resume" : through && request && this.helped ? "helped" : through && !request && !expected ? "through" : "";
     if (this.waits === `${what}${uploaded}`) return;

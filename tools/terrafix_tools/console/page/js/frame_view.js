@@ -16,7 +16,7 @@ export class FrameView {
     this.image = h("img", {alt: "", draggable: "false"});
     this.cross = h("div", {class: "cross", hidden: true, "aria-hidden": "true"});
     this.note = h("p", {class: "frame-note", hidden: true});
-    this.north = h("button", {type: "button", "aria-pressed": "false", title: t("north_up"), "aria-label": t("north_up"), onclick: () => this.turn(!this.isNorthUp)}, "N↑");
+    this.north = h("button", {type: "button", "aria-pressed": "false", title: t("north_up"), "aria-label": `N↑: ${t("north_up")}`, onclick: () => this.turn(!this.isNorthUp)}, "N↑");
     const button = (text, label, by) => h("button", {type: "button", "aria-label": t(label), title: t(label), onclick: () => this.zoomBy(by, this.at)}, text);
     this.view = h("div", {class: "frame-view", tabindex: 0, role: "application", "aria-label": t("frame_help")}, this.image, this.cross);
     this.element = h("div", {class: "frame"}, this.view, h("div", {class: "frame-tools"}, button("+", "zoom_in", STEP), button("−", "zoom_out", 1 / STEP), this.north), this.note);

@@ -110,6 +110,10 @@ async function start() {
 setLanguage(stored("language") ?? navigator.language.slice(0, 2));
 setTheme(stored("theme") ?? "system");
 setCoordinateFormat(stored("format"));
-addEventListener("pagehide", () => store("format", coordinateFormat()));
+addEventListener("pagehide", () => {
+  store("format", coordinateFormat());
+  view?.close(); // a page that the browser keeps for "back" would keep its stream, and a browser has six connections
+});
+addEventListener("pageshow", (event) => { if (event.persisted) route(); });
 addEventListener("hashchange", route);
 start();

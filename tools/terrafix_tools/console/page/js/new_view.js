@@ -12,14 +12,13 @@ import {BATCH, Upload, readTable} from "./upload.js";
 
 /** Uploads that run, by flight: the view of the flight shows them. */
 export const uploads = new Map();
-addEventListener("beforeunload", (event) => {
-  if ([...uploads.values()].some((upload) => upload.running)) event.preventDefault();
-});
+const warn = (event) => event.preventDefault();
 
 export async function startUpload(flightId, photos, table) {
   const upload = new Upload(flightId, photos, table);
   uploads.set(flightId, upload);
   upload.running = true;
+  addEventListener("beforeunload", warn);
   try {
     await upload.run();
     return true;
@@ -27,6 +26,7 @@ export async function startUpload(flightId, photos, table) {
     return false; // the card tells why
   } finally {
     upload.running = false;
+    if (![...uploads.values()].some((one) => one.running)) removeEventListener("beforeunload", warn);
     setTimeout(() => { if (uploads.get(flightId) === upload) uploads.delete(flightId); }, 8000);
   }
 }
