@@ -29,7 +29,7 @@ from terrafix.vision.sources.description import (
 )
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.autopilot.parameters import Kind
-from terrafix_lab.sim.camera.mount import CameraMount, Fixed, Gimbal
+from terrafix_lab.sim.camera.mount import Fixed, Gimbal
 from terrafix_lab.sim.camera.render import Film, Ground, Renderer
 from terrafix_lab.sim.flights.log import T0_US, TelemetryLog
 from terrafix_lab.sim.flights.path import FlownPath, fly
@@ -87,7 +87,7 @@ class Flight:
         return np.arange(math.floor(self.duration_s * self.frame_hz + 1e-6)) / self.frame_hz
 
     @property
-    def mount(self) -> CameraMount:
+    def mount(self) -> Fixed | Gimbal:
         """Fixed to the vehicle, or a gimbal, as the description of the camera says."""
         kind = Fixed if isinstance(self.camera.gimbal, UnsetType) else Gimbal
         return kind(Mount.of(self.camera))
