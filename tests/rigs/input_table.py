@@ -51,6 +51,7 @@ MAP_INPUTS: tuple[Row, ...] = (
         "ellipsoidal heights without a grid",
         ("map/inputs/test_elevation_units.py", (
             "test_ellipsoidal_heights_of_the_file_are_converted_or_refused",
+            "test_a_vertical_system_with_the_name_of_an_ellipsoid_counts_from_it",
             "test_what_is_assumed_of_a_plain_file_is_in_the_manifest_and_in_map_check",
         )),
     ),
@@ -87,7 +88,8 @@ MAP_INPUTS: tuple[Row, ...] = (
         "alpha instead of nodata; a nodata value that the pixels cannot hold is ignored",
         "an image without a valid pixel",
         ("map/inputs/test_image_masks.py", (
-            "test_alpha_wins_over_nodata", "test_nodata_that_8_bits_cannot_hold_is_ignored_with_a_word",
+            "test_alpha_wins_over_nodata", "test_an_alpha_band_in_any_place_is_the_mask",
+            "test_nodata_that_8_bits_cannot_hold_is_ignored_with_a_word",
             "test_a_collar_is_found_on_every_grid", "test_a_warped_source_of_a_mosaic_has_no_collar_either",
             "test_the_masks_of_the_field",
         )),
@@ -105,12 +107,13 @@ MAP_INPUTS: tuple[Row, ...] = (
     ),
     Row(
         "area", "KML (any encoding, KMZ, gx:Track, DJI's way points), GeoJSON, a box", "degrees", "WGS 84",
-        "points alone are a path in their order; points beside outlines are left out",
-        "decimal commas; a single point",
+        "points alone are a path in their order; points beside outlines and links to other documents are left out",
+        "decimal commas; a single point; a link alone",
         ("map/inputs/test_area_files.py", (
             "test_a_kml_is_read_in_its_encoding_declared_or_not",
             "test_spaces_behind_commas_are_read_and_decimal_commas_refused",
-            "test_a_track_and_the_points_of_a_planner_are_paths", "test_an_archive_is_read_by_its_document",
+            "test_a_track_and_the_points_of_a_planner_are_paths", "test_a_link_to_another_document_is_named",
+            "test_an_archive_is_read_by_its_document",
             "test_every_area_of_the_field_has_its_size_or_is_refused",
         )),
     ),
@@ -131,99 +134,189 @@ MAP_INPUTS: tuple[Row, ...] = (
 
 FLIGHT_INPUTS: tuple[Row, ...] = (
     Row(
-        "focal length of photos", "EXIF, XMP of DJI and Pix4D, sensor table", "px of the stored photo", "-",
-        "digital zoom is not in FocalLength or the calibration; resized by EXIF's size, else by the principal "
-        "point", "cut; calibration that FocalLengthIn35mmFilm contradicts; zoom with the 35 mm equivalent alone",
-        ("vision/test_photo_makers.py", (
-            "test_the_digital_zoom_multiplies_the_focal_length_of_the_lens",
-            "test_calibration_and_principal_point_are_scaled_with_the_photo",
-            "test_a_calibration_of_another_size_or_lens_is_refused_with_the_reason",
-            "test_a_zoom_with_the_35_mm_equivalent_alone_is_refused_since_makers_differ",
-        )),
+        "focal length of photos",
+        "EXIF, XMP of DJI and Pix4D, sensor table",
+        "px of the stored photo",
+        "-",
+        "digital zoom is not in FocalLength or the calibration; resized by EXIF's size, else by the principal point",
+        "cut; calibration that FocalLengthIn35mmFilm contradicts; zoom with the 35 mm equivalent alone",
+        (
+            "vision/test_photo_makers.py",
+            (
+                "test_the_digital_zoom_multiplies_the_focal_length_of_the_lens",
+                "test_calibration_and_principal_point_are_scaled_with_the_photo",
+                "test_a_calibration_of_another_size_or_lens_is_refused_with_the_reason",
+                "test_a_zoom_with_the_35_mm_equivalent_alone_is_refused_since_makers_differ",
+            ),
+        ),
     ),
     Row(
-        "lenses of a folder of photos", "focal length over width of each photo", "-", "-",
-        "up to a tenth of another lens is left out", "several lenses or zooms, both groups named",
-        ("vision/test_photo_makers.py", (
-            "test_photos_of_two_lenses_are_refused_with_both_groups",
-            "test_a_few_photos_of_another_lens_are_left_out_with_a_word",
-        )),
+        "lenses of a folder of photos",
+        "focal length over width of each photo",
+        "-",
+        "-",
+        "up to a tenth of another lens is left out",
+        "several lenses or zooms, both groups named",
+        (
+            "vision/test_photo_makers.py",
+            (
+                "test_photos_of_two_lenses_are_refused_with_both_groups",
+                "test_a_few_photos_of_another_lens_are_left_out_with_a_word",
+            ),
+        ),
     ),
     Row(
-        "attitude of photos", "XMP of DJI (gimbal), Autel and Pix4D (Camera), Parrot", "degrees",
+        "attitude of photos",
+        "XMP of DJI (gimbal), Autel and Pix4D (Camera), Parrot",
+        "degrees",
         "true north; DJI: pitch from the horizon; Pix4D: from straight down, below -45 from the horizon",
-        "1-sigma of the tilt 9 degrees, unless flight.toml says it; 0/0/0, headings that are all zero: not "
-        "reported", "-",
-        ("vision/test_photo_makers.py", (
-            "test_attitudes_of_several_makers_are_those_of_one_vehicle",
-            "test_gimbal_angles_of_zero_leave_the_flights_heading_and_a_wide_mount",
-            "test_a_stated_accuracy_of_the_tilt_replaces_that_of_photos",
-            "test_what_is_exactly_zero_in_all_photos_is_not_reported",
-        )),
+        "1-sigma of the tilt 9 degrees, unless flight.toml says it; 0/0/0, headings that are all zero: not reported; "
+        "yaws of gimbal and flight more than 30 degrees apart are the 1-sigma of the heading",
+        "-",
+        (
+            "vision/test_photo_makers.py",
+            (
+                "test_attitudes_of_several_makers_are_those_of_one_vehicle",
+                "test_gimbal_angles_of_zero_leave_the_flights_heading_and_a_wide_mount",
+                "test_a_stated_accuracy_of_the_tilt_replaces_that_of_photos",
+                "test_what_is_exactly_zero_in_all_photos_is_not_reported",
+                "test_a_gimbal_yaw_far_from_that_of_the_flight_widens_the_heading",
+            ),
+        ),
     ),
     Row(
-        "height of photos", "RelativeAltitude (DJI), AboveGroundAltitude (Autel, Pix4D)", "m",
-        "above take-off; above ground", "zero in all photos: not reported", "a median above 5000 m",
+        "height of photos",
+        "RelativeAltitude (DJI), AboveGroundAltitude (Autel, Pix4D)",
+        "m",
+        "above take-off; above ground",
+        "zero in all photos: not reported",
+        "a median above 5000 m",
         ("vision/test_photo_makers.py", ("test_the_height_of_autel_and_pix4d_is_read",)),
     ),
     Row(
-        "files in a folder of photos", "names", "-", "-", "`._*`, `Thumbs.db` and other files are left out",
+        "files in a folder of photos",
+        "names",
+        "-",
+        "-",
+        "`._*`, `Thumbs.db` and other files are left out",
         "a folder without photos",
         ("vision/test_photo_makers.py", ("test_files_of_macos_and_windows_beside_photos_are_left_out",)),
     ),
     Row(
-        "clock of a telemetry log", "time stamps of the records", "microseconds",
+        "clock of a telemetry log",
+        "time stamps of the records",
+        "microseconds",
         "since 1970, of the logging computer",
         "jumps above 1 s and damaged stamps are repaired by the autopilot's time; without it a jump is no gap",
         "packets without time stamps",
-        ("autopilot_log/test_log_clock_and_vehicles.py", (
-            "test_a_jump_of_the_logs_clock_is_repaired_by_the_autopilots_own_time_and_said",
-            "test_one_damaged_bit_of_a_time_stamp_costs_nothing",
-            "test_without_the_autopilots_time_a_jump_is_taken_for_no_gap_and_said",
-            "test_a_stream_of_packets_without_time_stamps_is_no_log",
-        )),
+        (
+            "autopilot_log/test_log_clock_and_vehicles.py",
+            (
+                "test_a_jump_of_the_logs_clock_is_repaired_by_the_autopilots_own_time_and_said",
+                "test_one_damaged_bit_of_a_time_stamp_costs_nothing",
+                "test_without_the_autopilots_time_a_jump_is_taken_for_no_gap_and_said",
+                "test_a_stream_of_packets_without_time_stamps_is_no_log",
+            ),
+        ),
     ),
     Row(
-        "vehicle of a telemetry log", "system ids of autopilots", "-", "-",
-        "the only one that moves; `--system`, `[telemetry] system_id` choose", "several that move",
-        ("autopilot_log/test_log_clock_and_vehicles.py", (
-            "test_of_two_vehicles_the_one_that_moves_is_read_and_both_are_named",
-            "test_the_vehicle_of_a_log_is_chosen_by_system_and_by_system_id",
-            "test_of_two_vehicles_that_fly_none_is_guessed",
-        )),
-    ),
-    Row(
-        "flight modes", "custom_mode by MAV_TYPE, or the firmware's banner", "-", "-", "an unknown type has numbers",
+        "vehicle of a telemetry log",
+        "system ids of autopilots",
         "-",
-        ("autopilot_log/test_log_clock_and_vehicles.py", (
-            "test_modes_are_named_by_the_type_of_the_vehicle_and_unknown_types_have_no_names",
-        )),
+        "-",
+        "the only one that moves; `--system`, `[telemetry] system_id` choose",
+        "several that move",
+        (
+            "autopilot_log/test_log_clock_and_vehicles.py",
+            (
+                "test_of_two_vehicles_the_one_that_moves_is_read_and_both_are_named",
+                "test_the_vehicle_of_a_log_is_chosen_by_system_and_by_system_id",
+                "test_of_two_vehicles_that_fly_none_is_guessed",
+            ),
+        ),
     ),
     Row(
-        "DataFlash log", "messages FMT anywhere in the file", "as its format characters say",
-        "start of the autopilot; logs of 2013: GPS week", "lost, zero and foreign bytes are skipped and counted",
+        "flight modes",
+        "custom_mode by MAV_TYPE, or the firmware's banner",
+        "-",
+        "-",
+        "an unknown type has numbers",
+        "-",
+        (
+            "autopilot_log/test_log_clock_and_vehicles.py",
+            ("test_modes_are_named_by_the_type_of_the_vehicle_and_unknown_types_have_no_names",),
+        ),
+    ),
+    Row(
+        "DataFlash log",
+        "messages FMT anywhere in the file",
+        "as its format characters say",
+        "start of the autopilot; logs of 2013: GPS week",
+        "lost, zero and foreign bytes are skipped and counted",
         "a file without a whole FMT",
-        ("autopilot_log/test_dataflash_damage.py", (
-            "test_lost_zero_and_foreign_bytes_are_skipped_and_counted",
-            "test_a_text_log_of_2013_has_its_times_from_the_gps_and_names_of_modes",
-            "test_what_has_no_whole_format_is_no_log",
-        )),
+        (
+            "autopilot_log/test_dataflash_damage.py",
+            (
+                "test_lost_zero_and_foreign_bytes_are_skipped_and_counted",
+                "test_a_text_log_of_2013_has_its_times_from_the_gps_and_names_of_modes",
+                "test_what_has_no_whole_format_is_no_log",
+            ),
+        ),
     ),
     Row(
-        "temperature", "thermal zones of sysfs", "0.001 degrees Celsius", "-",
+        "telemetry of GoPro",
+        "GPMF in the video: GPS5, GPS9",
+        "degrees",
+        "WGS 84",
+        "positions are truth; inertial streams and orientation are not read, since their axes are not stated",
+        "-",
+        ("vision/test_source_gpmf.py", ("test_positions_of_a_gopro_are_truth_at_the_times_of_the_frames",)),
+    ),
+    Row(
+        "topics of a ROS bag",
+        "types, mavros's names; `--topic`, `[source] topics`",
+        "SI; headings in degrees",
+        "east, north, up; forward, left, up (REP 103, 145)",
+        "a true heading in the orientation of Imu; stamps 10 s from the time of recording are of another clock; an "
+        "orientation that never changes: not reported; NavSatFix is not read",
+        "several topics of a kind; no images; no CameraInfo",
+        (
+            "vision/test_source_rosbag.py",
+            (
+                "test_telemetry_of_a_bag_is_in_the_axes_of_the_vehicle",
+                "test_several_topics_are_asked_for_and_chosen",
+                "test_stamps_of_another_clock_give_way_to_the_times_of_recording",
+                "test_an_orientation_that_never_changes_is_not_reported",
+                "test_positions_of_a_bag_are_truth_and_nothing_else",
+            ),
+        ),
+    ),
+    Row(
+        "temperature",
+        "thermal zones of sysfs",
+        "0.001 degrees Celsius",
+        "-",
         "PMIC-Die at 100, and what never changes, does not decide; `[health] zones` chooses",
         "outside of -55 to 150 degrees",
-        ("health/test_zones.py", (
-            "test_the_die_of_the_pmic_at_its_normal_value_does_not_decide",
-            "test_a_zone_that_never_changes_while_others_do_stops_deciding_after_a_minute",
-            "test_health_zones_chooses",
-        )),
+        (
+            "health/test_zones.py",
+            (
+                "test_the_die_of_the_pmic_at_its_normal_value_does_not_decide",
+                "test_a_zone_that_never_changes_while_others_do_stops_deciding_after_a_minute",
+                "test_health_zones_chooses",
+            ),
+        ),
     ),
     Row(
-        "power", "hwmon", "mV, mA, microwatts", "-", "-", "shunts and sums of an INA3221",
+        "power",
+        "hwmon",
+        "mV, mA, microwatts",
+        "-",
+        "-",
+        "shunts and sums of an INA3221",
         ("health/test_zones.py", ("test_shunts_and_sums_of_an_ina3221_are_no_rails_and_a_power_counts_once",)),
     ),
-)  # fmt: skip
+)
 
 TABLES = {"map": MAP_INPUTS, "flight": FLIGHT_INPUTS}
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simulated_flight import EstimatorRun, Flight, cov_of, error_m, without_fix
-from terrafix.estimator.models.terrain_roughness import CANDIDATES, TerrainRoughness
+from terrafix.estimator.models.terrain_roughness import ROUGHNESS_CANDIDATES, TerrainRoughness
 
 FRAMES = 240
 
@@ -77,7 +77,7 @@ def walked(rise: float, metres: float, roughness: TerrainRoughness, seed: int) -
     return estimates
 
 
-@pytest.mark.parametrize("rise", CANDIDATES)
+@pytest.mark.parametrize("rise", ROUGHNESS_CANDIDATES)
 def test_the_roughness_estimate_converges_to_the_true_walk(rise: float) -> None:
     ends = [np.mean(walked(rise, 6000.0, TerrainRoughness(), seed)[-20:]) for seed in range(8)]
     assert 0.7 * rise < np.median(ends) < 2.5 * rise
