@@ -220,7 +220,7 @@ def test_a_flight_is_created_at_once_and_the_map_of_its_route_is_made_meanwhile(
 
 def test_images_are_uploaded_while_the_map_is_made(helped: Helped) -> None:
     assert helped.accepted == [[*range(10)], [*range(10, 21)]]
-    assert helped.lost.images.next_number == 10
+    assert helped.lost.images.uploaded == 10
 
 
 def test_a_flight_beside_its_map_searches_all_of_it_and_asks_for_help(helped: Helped) -> None:

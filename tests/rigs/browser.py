@@ -24,6 +24,10 @@ def program() -> str | None:
     return next((found for name in PROGRAMS if (found := shutil.which(name))), None)
 
 
+def _box(selector: str) -> str:
+    return f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+
+
 class PageError(AssertionError):
     """A script of the page, or one that a test ran in it, failed."""
 
@@ -68,7 +72,7 @@ class Browser:
         os.close(self._in)
         self._profile.cleanup()
 
-    def _call(self, method: str, limit_s: float = 20.0, **parameters: Any) -> dict[str, Any]:
+    def _call(self, method: str, limit_s: float = 60.0, **parameters: Any) -> dict[str, Any]:
         self._last += 1
         message: dict[str, Any] = {"id": self._last, "method": method, "params": parameters}
         if self._session:
@@ -125,10 +129,10 @@ class Browser:
             raise PageError(details.get("exception", {}).get("description", details["text"]))
         return answer["result"].get("value")
 
-    def wait(self, script: str, limit_s: float = 10.0) -> None:
-        """Until an expression is true."""
+    def wait(self, script: str, limit_s: float = 40.0) -> None:
+        """Until an expression, or the value of a promise, is true."""
         end_s = time.monotonic() + limit_s
-        while not self.run(f"Boolean({script})"):
+        while not self.run(f"Promise.resolve({script}).then(Boolean)"):
             if time.monotonic() > end_s:
                 text = self.run("document.body.innerText.slice(0, 2000)")
                 raise PageError(f"not within {limit_s} s: {script}\n{text}\n{self.errors}")
@@ -145,9 +149,20 @@ class Browser:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self._call("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **at)
 
-    def press(self, key: str) -> None:
+    def press(self, key: str, text: str = "") -> None:
+        """``text``: what the key enters into a field; Enter and space act only with theirs."""
+        given = {"Enter": "\r", " ": " "}.get(key, text)
+        code = {"Enter": 13, "Tab": 9, " ": 32}.get(key, 0)
         for kind in ("keyDown", "keyUp"):
-            self._call("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+            down: dict[str, Any] = {"text": given} if given and kind == "keyDown" else {}
+            self._call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code, **down)
+
+    def drop(self, selector: str, paths: list[Path]) -> None:
+        """Files or folders, in the middle of an element."""
+        box = self.run(f"(({{x, y, width, height}}) => [x + width / 2, y + 40])({_box(selector)})")
+        data = {"items": [], "files": [str(path) for path in paths], "dragOperationsMask": 1}
+        for kind in ("dragEnter", "dragOver", "drop"):
+            self._call("Input.dispatchDragEvent", type=kind, x=box[0], y=box[1], data=data)
 
     def choose_files(self, selector: str, paths: list[Path]) -> None:
         root = self._call("DOM.getDocument")["root"]["nodeId"]

@@ -1,5 +1,6 @@
 """A console in a thread of the test, plain HTTP requests to it, and images to upload."""
 
+import io
 import json
 import socket
 import subprocess
@@ -15,6 +16,7 @@ from typing import Any, Self
 import cv2
 import numpy as np
 import urllib3
+from PIL import Image
 
 import small_map
 from terrafix_tools.console.app import make_app
@@ -200,3 +202,23 @@ def jpeg(seed: int = 0, width: int = 640, height: int = 480) -> bytes:
 def batch(first: int, count: int = 10, content: bytes | None = None) -> list[tuple[str, str, bytes]]:
     """Images by the numbers from ``first`` on; equal ones if ``content`` is given."""
     return [("images", f"IMG_{number:04d}.jpg", content or jpeg(number)) for number in range(first, first + count)]
+
+
+XMP = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    '<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:RelativeAltitude="+92.4" '
+    'drone-dji:GimbalYawDegree="91.0" drone-dji:GimbalPitchDegree="-90.0"></rdf:Description></rdf:RDF></x:xmpmeta>'
+)
+
+
+@cache
+def photo(second: int = 0, lat_deg: float = 0.0, lon_deg: float = 0.0) -> bytes:
+    """640 x 480 px as a drone writes it: time, 24 mm (of 35 mm film), position (north, east), height 92.4 m, looking
+    down, image top to 91 degrees."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x9003: f"2024:05:06 10:{second // 60:02}:{second % 60:02}", 0xA405: 24})
+    exif.get_ifd(0x8825).update({1: "N", 2: (lat_deg, 0.0, 0.0), 3: "E", 4: (lon_deg, 0.0, 0.0)})
+    written = io.BytesIO()
+    with Image.open(io.BytesIO(jpeg(0))) as image:
+        image.save(written, "JPEG", exif=exif, xmp=XMP.encode())
+    return written.getvalue()

@@ -48,9 +48,9 @@ from terrafix.anchor.relocalization.relocalizer import (
 from terrafix.anchor.verification.converged_place import PlaceTest
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
 from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
-from terrafix.core.camera import CameraCalibration
+from terrafix.core.camera import CameraCalibration, Readout
 from terrafix.core.gate import SIGMAS_95
-from terrafix.core.geodesy import LocalFrame
+from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.node import Image
@@ -191,7 +191,9 @@ class Localizer:
         """Moves belief and search by odometry. The first prediction of a flight initialises the belief."""
         if self._layers is None or self._origin is None:
             return
-        self._layers.set_distortion(prediction.radial_k1)
+        r_w_c = rot_from_quat(prediction.q_w_c)
+        readout = Readout.of(self._origin.camera, prediction.readout_motion, r_w_c)
+        self._layers.set_lens(prediction.radial_k1, readout)
         best = self._layers.best
         cell_m = belief_cell_m(prediction.agl_m, best.matcher.correlation_cell_m(prediction.agl_m))
         step_m = float(np.hypot(*prediction.step_m))

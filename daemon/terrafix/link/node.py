@@ -239,6 +239,7 @@ class LinkNode:
 
     def _on_ekf_status(self, status: EkfStatus) -> list[Message]:
         self._ekf_monitor.on_status(status)
+        self._gnss.on_ekf_status(status)
         return []
 
     def _on_search_state(self, state: SearchState) -> list[Message]:

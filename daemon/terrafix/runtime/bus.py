@@ -21,7 +21,7 @@ import zmq
 
 from terrafix.core import codec
 from terrafix.core.clock import now_ns
-from terrafix.messages import GpsInput, InputOrder, Message, Origin, ProcessEvent, SourceEnded
+from terrafix.messages import GpsInput, InputOrder, Message, Origin, ProcessEvent, SourceEnded, SourceFacts
 
 # messages per connection and side; beyond it the newest are lost, and counted by the subscriber
 BUS_QUEUE_LENGTH = 1000
@@ -44,6 +44,7 @@ class Retention(NamedTuple):
 # sends to the autopilot is recorded although the recorder connects late, on a computer with too much to do.
 RETAINED: dict[type[Message], Retention] = {
     Origin: Retention(1, NO_EXPIRY_NS),
+    SourceFacts: Retention(1, NO_EXPIRY_NS),
     SourceEnded: Retention(1, NO_EXPIRY_NS),
     ProcessEvent: Retention(100, 10_000_000_000),
     GpsInput: Retention(100, 10_000_000_000, until_recorded=True),

@@ -88,17 +88,17 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
     flight.searches(1)
     lost = flight.frame(LOST, WIDEN)
     assert of_kind(lost, SearchExpanded, StateChanged) == [
-        SearchExpanded(frame_id=1, grid_size=1, status="widen"),
+        SearchExpanded(frame_id=1, file="0001.jpg", grid_size=1, status="widen"),
         StateChanged(state=FlightState.RECOVERING, previous=FlightState.PROCESSING),
     ]
     assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded, StateChanged) == []
     flight.searches(4)
     assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded) == [
-        SearchExpanded(frame_id=3, grid_size=4, status="widen")
+        SearchExpanded(frame_id=3, file="0003.jpg", grid_size=4, status="widen")
     ]
     flight.searches(None, [(48.0 + 0.001 * k, 11.0) for k in range(5)])
     assert of_kind(flight.frame(LOST, WHOLE), SearchExpanded) == [
-        SearchExpanded(frame_id=4, grid_size=None, status="whole_map")
+        SearchExpanded(frame_id=4, file="0004.jpg", grid_size=None, status="whole_map")
     ]
     asked = flight.frame(LOST, ASK)
     (needed,) = of_kind(asked, UserInputNeeded)
@@ -112,12 +112,12 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
     assert of_kind(again, UserInputNeeded, StateChanged) == [] and again.state is FlightState.BLOCKED
     found = flight.frame(m.Verdict.ACCEPTED, m.SearchStep.MERGE)
     assert of_kind(found, SearchExpanded, StateChanged) == [
-        SearchExpanded(frame_id=7, grid_size=None, status="found"),
+        SearchExpanded(frame_id=7, file="0007.jpg", grid_size=None, status="found"),
         StateChanged(state=FlightState.PROCESSING, previous=FlightState.BLOCKED),
     ]
     assert found.request is None
     assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded) == [
-        SearchExpanded(frame_id=8, grid_size=None, status="widen")  # nothing of the search before
+        SearchExpanded(frame_id=8, file="0008.jpg", grid_size=None, status="widen")  # nothing of the search before
     ]
 
 
@@ -142,7 +142,7 @@ def test_a_fragment_that_begins_joined_is_merged_with_its_first_frame() -> None:
     flight = ObservedFlight()
     assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
     outcome = flight.frame(m.Verdict.UNCONFIRMED, fragment=1, joined=True)
-    assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=1, frames=1)]
+    assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=1, file="0001.jpg", frames=1)]
     assert flight.observer.completed().statistics["merged"] == 1
 
 
@@ -158,8 +158,8 @@ def test_a_fragment_is_unanchored_then_matching_then_anchored_or_merged() -> Non
     merged = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
     changed = [*of_kind(began, FragmentChanged), *of_kind(merged, FragmentChanged)]
     assert changed == [
-        FragmentChanged(fragment_id=1, frame_id=4, state=FragmentState.UNANCHORED),
-        FragmentChanged(fragment_id=1, frame_id=5, state=FragmentState.MERGED),
+        FragmentChanged(fragment_id=1, frame_id=4, file="0004.jpg", state=FragmentState.UNANCHORED),
+        FragmentChanged(fragment_id=1, frame_id=5, file="0005.jpg", state=FragmentState.MERGED),
     ]
 
 
@@ -167,10 +167,10 @@ def test_a_search_is_a_recovery_that_starts_and_succeeds_once() -> None:
     flight = ObservedFlight()
     flight.frame(m.Verdict.ACCEPTED)
     (started,) = of_kind(flight.frame(LOST, WIDEN), RecoveryStarted)
-    assert started == RecoveryStarted(frame_id=1)
+    assert started == RecoveryStarted(frame_id=1, file="0001.jpg")
     assert of_kind(flight.frame(LOST, ASK), RecoveryStarted, RecoverySucceeded) == []
     (succeeded,) = of_kind(flight.frame(m.Verdict.ACCEPTED), RecoveryStarted, RecoverySucceeded)
-    assert succeeded == RecoverySucceeded(frame_id=3, frames=2)
+    assert succeeded == RecoverySucceeded(frame_id=3, file="0003.jpg", frames=2)
 
 
 @pytest.mark.parametrize(("verdict", "kind"), [("accepted", UserFixApplied), ("innovation", VerdictGiven)])
@@ -201,7 +201,7 @@ def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
     assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
     flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=False)
     outcome = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
-    assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=2, frames=2)]
+    assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=2, file="0002.jpg", frames=2)]
     assert outcome.fragment is not None and outcome.fragment.merged_at_frame == 2
     assert of_kind(flight.frame(m.Verdict.ACCEPTED, fragment=1), ChunkMerged, FragmentChanged) == []
     statistics = flight.observer.completed().statistics

@@ -15,11 +15,17 @@ from typing import Any
 
 import pytest
 
-from console_rig import BOUNDARY, CAMERA, NEW, Answer, Console, batch, jpeg, multipart, settings
+from console_rig import BOUNDARY, CAMERA, NEW, Answer, Console, batch, jpeg, multipart, photo, settings
 from small_disk import small_disk
+from terrafix.core.errors import SourceError
+from terrafix.vision.sources.description import ATTITUDE_SIGMA_DEG
+from terrafix.vision.sources.photos import STATED_TILT_SIGMA_DEG
 from terrafix_tools.console import uploads
+from terrafix_tools.console.compute.source import UploadedImages
+from terrafix_tools.console.new_flight import new_flight
 from terrafix_tools.console.openapi import schema
 from terrafix_tools.console.settings import ServiceLimits
+from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import FILE
 
 
@@ -87,22 +93,25 @@ def test_a_flight_that_is_not_valid_is_refused_with_the_field(
     assert_refused(answer, 404 if changes.get("map") else 422, word)
 
 
-def test_images_become_frames_in_the_sequence_of_their_numbers_over_batches(console: Console) -> None:
+def test_images_become_frames_in_the_order_of_their_names_over_batches_whatever_gaps_they_have(
+    console: Console,
+) -> None:
     flight_id = console.create()
-    first = console.upload(flight_id, batch(7))
+    first = console.upload(flight_id, batch(20))
     assert (first.status, first.json) == (
         202,
-        {"frames": [*range(10)], "repeated": False, "next_number": 17},
+        {"frames": [*range(10)], "repeated": False},
     )
-    assert_refused(console.upload(flight_id, batch(18)), 409, "expected 17")
-    assert console.upload(flight_id, batch(17, 12)).json["frames"] == [*range(10, 22)]
+    assert_refused(console.upload(flight_id, batch(5, 12)), 409, "IMG_0005.jpg", "IMG_0029.jpg")
+    assert console.upload(flight_id, batch(98, 12)).json["frames"] == [*range(10, 22)]
     assert console.send("GET", f"/flights/{flight_id}").json["images"] == {
         "uploaded": 22,
         "processed": 0,
-        "next_number": 29,
+        "expected": None,
+        "last_name": "IMG_0109.jpg",
     }
     image = console.send("GET", f"/flights/{flight_id}/frames/11/image")
-    assert image.body == jpeg(18) and image.headers["content-type"] == "image/jpeg"
+    assert image.body == jpeg(99) and image.headers["content-type"] == "image/jpeg"
     assert image.headers["x-content-type-options"] == "nosniff"
     assert_refused(console.send("GET", f"/flights/{flight_id}/frames/22/image"), 404)
 
@@ -113,7 +122,7 @@ def test_a_batch_that_is_sent_again_has_the_same_frames_and_is_not_stored_twice(
     assert console.upload(flight_id, sent).json["repeated"] is False
     console.upload(flight_id, batch(11))
     again = console.upload(flight_id, sent)
-    assert (again.status, again.json) == (202, {"frames": [*range(10)], "repeated": True, "next_number": 21})
+    assert (again.status, again.json) == (202, {"frames": [*range(10)], "repeated": True})
     other = [*sent[:9], (*sent[9][:2], jpeg(99))]
     assert_refused(console.upload(flight_id, other), 409, "IMG_0010.jpg")
     assert console.send("GET", f"/flights/{flight_id}").json["images"]["uploaded"] == 20
@@ -124,11 +133,11 @@ def test_a_batch_that_is_sent_again_has_the_same_frames_and_is_not_stored_twice(
     [
         (batch(1, 9), 422, "9 images"),
         (batch(1, 51, b"x"), 422, "50"),
-        ([*batch(1, 9), ("images", "IMG_0011.jpg", jpeg())], 409, "expected 10"),
+        ([*batch(1, 9), ("images", "IMG_0008.jpg", jpeg())], 409, "IMG_0008.jpg does not come after IMG_0009.jpg"),
+        ([*batch(1, 9), ("images", "IMG_0009.jpg", jpeg())], 409, "does not come after"),
         ([*batch(1, 9), ("images", "../../IMG_0010.jpg", jpeg())], 422, "no name of an image"),
         ([*batch(1, 9), ("images", "a/IMG_0010.jpg", jpeg())], 422, "no name of an image"),
         ([*batch(1, 9), ("images", ".IMG_0010.jpg", jpeg())], 422, "no name of an image"),
-        ([*batch(1, 9), ("images", "photo.jpg", jpeg())], 422, "ends in its number"),
         ([*batch(1, 9), ("images", "IMG_0010.jpg", b"")], 422, "not a JPEG or PNG"),
         ([*batch(1, 9), ("images", "IMG_0010.jpg", b"GIF89a" + jpeg())], 422, "not a JPEG or PNG"),
         ([*batch(1, 9), ("images", "IMG_0010.jpg", b"\xff\xd8\xff" + b"\x00" * 99)], 422, "not a JPEG or PNG"),
@@ -338,3 +347,106 @@ def test_without_the_console_extra_one_line_states_what_to_install(tmp_path: Pat
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
     assert done.stderr == "terrafix: this command needs fastapi; install it: pip install 'terrafix[console]'\n"
+
+
+def facts(console: Console, parts: list[tuple[str, str, bytes]]) -> Answer:
+    kind = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
+    return console.send("POST", "/photos", multipart(parts), kind)
+
+
+def test_photos_state_what_replay_takes_from_them_and_where_it_comes_from(console: Console) -> None:
+    heads = [
+        ("images", f"DJI_{i:04d}.JPG", photo(i, 23.5, 121.0)[:-2000]) for i in (3, 9)
+    ]  # their first bytes are enough
+    found = facts(console, heads).json
+    assert (found["width"], found["height"]) == (640, 480)
+    assert found["camera"]["fx"] == pytest.approx(24 / 43.267 * 800, rel=1e-3)
+    assert (found["start"]["lat"], found["start"]["lon"]) == (23.5, 121.0)
+    assert (found["height_m"], found["yaw_deg"], found["mount"]["tolerance_deg"]) == (92.4, 91.0, 9.0)
+    said = {fact["topic"]: fact["text"] for fact in found["facts"]}
+    assert (
+        "FocalLengthIn35mmFilm" in " ".join(f["text"] for f in found["facts"])
+        and "GPS of the first photo" in said["start"]
+    )
+    assert "RelativeAltitude" in said["height"] and "DateTimeOriginal of 2 of 2" in said["clock"]
+    table = b"name = 'field'\nmap = 'maps/town.gpkg'\n[camera]\nwidth=640\nheight=480\nfx=500\nfy=500\ncx=320\ncy=240\n"
+    described = facts(console, [*heads, ("description", "flight.toml", table)]).json
+    assert (described["name"], described["map"], described["camera"]["fx"]) == ("field", "town", 500.0)
+
+
+def test_photos_without_a_focal_length_state_the_rest_and_why(console: Console) -> None:
+    found = facts(console, [("images", "a.jpg", jpeg())]).json
+    assert (found["width"], found["camera"], found["start"]) == (640, None, None)
+    assert "no photo says its focal length" in found["problem"]
+    assert_refused(facts(console, [("images", "a.jpg", b"no photo")]), 422)
+    assert_refused(facts(console, [("description", "flight.toml", b"x = [")]), 422)
+
+
+def test_a_copy_has_the_images_and_hints_of_a_flight_and_its_own_settings(console: Console) -> None:
+    flight_id = console.create(height_m=80.0)
+    console.upload(flight_id, batch(1))
+    hint = {"lat": 48.0, "lon": 14.0}
+    fix = {"frame_id": 6, "pixel": {"u": 1, "v": 2}, "lat": 48.0, "lon": 14.0}
+    for path, body in (("hint", hint), ("user-fix", fix)):
+        assert console.send("POST", f"/flights/{flight_id}/{path}", body).status == 202
+    new = {**NEW, "camera": {**CAMERA, "fx": 510.0}, "height_m": 95.0, "override": True}
+    made = console.send("POST", f"/flights/{flight_id}/copy", new)
+    assert made.status == 201
+    copy = made.json
+    assert copy["flight_id"] != flight_id
+    assert copy["images"] == {"uploaded": 10, "processed": 0, "expected": 10, "last_name": "IMG_0010.jpg"}
+    assert console.send("GET", f"/flights/{copy['flight_id']}/frames/4/image").body == jpeg(5)
+    with console.service.database.read() as db:
+        states = [image.state for image in flights.images_of(db, copy["flight_id"], 0)]
+        assert all(state is not None and '"agl_m":95.0' in state for state in states)
+        assert flights.has_hints_before(db, copy["flight_id"], 6)
+    with console.service.database.write() as db:
+        assert len(flights.hints_before(db, copy["flight_id"], 6)) == 1
+        assert len(flights.hints_before(db, copy["flight_id"], 0)) == 1
+    assert console.send("DELETE", f"/flights/{flight_id}").status == 204
+    assert console.send("GET", f"/flights/{copy['flight_id']}/frames/4/image").body == jpeg(5)
+    assert_refused(console.send("POST", f"/flights/{console.create()}/copy", NEW), 409, "no images")
+
+
+def test_a_flight_that_failed_is_tried_again_and_no_other(console: Console) -> None:
+    flight_id = console.create()
+    console.upload(flight_id, batch(1))
+    assert_refused(console.send("POST", f"/flights/{flight_id}/retry"), 409, "copy")
+    with console.service.database.write() as db:
+        flights.count_attempt(db, flight_id, 3)
+        flights.update(db, flight_id, state="blocked", error="its process died")
+    answer = console.send("POST", f"/flights/{flight_id}/retry")
+    assert (answer.status, answer.json["state"], answer.json["error"]) == (202, "processing", "")
+    with console.service.database.read() as db:
+        assert flights.image_of(db, flight_id, 3).attempts == 0
+
+
+def test_a_flight_is_created_from_any_flight_toml_of_a_pinhole_camera(tmp_path: Path) -> None:
+    camera = "[camera]\nwidth=640\nheight=480\nfx=500\nfy=500\ncx=320\ncy=240\n"
+    (tmp_path / "flight.toml").write_text(camera + "[telemetry]\nyaw_sigma_deg=4\n[start]\nlat_deg=5\nlon_deg=6\n")
+    new = new_flight(tmp_path / "flight.toml", "town", None, 1000.0, None, "")
+    assert (new.camera.fx, new.telemetry.yaw_sigma_deg, new.telemetry.attitude_sigma_deg) == (500.0, 4.0, None)
+    (tmp_path / "flight.toml").write_text(camera + 'model="fisheye"\ndistortion=[0, 0, 0, 0]\n')
+    with pytest.raises(SourceError, match="pinhole cameras only"):
+        new_flight(tmp_path / "flight.toml", "town", None, 1000.0, None, "")
+
+
+def test_the_tilt_of_photos_is_known_less_well_than_that_of_a_table(console: Console, tmp_path: Path) -> None:
+    sigmas = {}
+    rows = b"file,t_s,yaw_deg\n" + b"".join(b"IMG_%04d.jpg,%d,90\n" % (i, i) for i in range(10))
+    for name, parts in {
+        "photos": [("images", f"IMG_{i:04d}.jpg", photo(i, 23.5, 121.0)) for i in range(10)],
+        "table": [*batch(0), ("telemetry", "frames.csv", rows)],
+    }.items():
+        flight_id = console.create()
+        assert console.upload(flight_id, parts).status == 202
+        source = UploadedImages(
+            console.service.database,
+            flight_id,
+            tmp_path,
+            wait=lambda: None,
+            begins=lambda _: None,
+            steer=lambda *_: None,
+        )
+        sigmas[name] = source.origin().attitude_sigma_deg
+    assert sigmas == {"photos": STATED_TILT_SIGMA_DEG, "table": ATTITUDE_SIGMA_DEG}

@@ -28,6 +28,9 @@ from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images,
 from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 from terrafix.recorder.segments import MEGABYTE, SegmentRing
 from terrafix.recorder.writer import FlightWriter
+from terrafix_tools.log.edit import cut
+from terrafix_tools.report.data import FlightView
+from terrafix_tools.report.sections_run import provenance
 
 pytestmark = pytest.mark.real_time
 
@@ -85,6 +88,23 @@ def test_recorded_messages_are_read_back(tmp_path: Path) -> None:
     pictures = dict(read_thumbnails(tmp_path))
     assert len(pictures) == 20
     assert pictures[3].startswith(b"\xff\xd8")
+
+
+def test_every_segment_and_the_report_have_what_the_source_says(tmp_path: Path) -> None:
+    said = m.SourceFacts(t_ns=5, facts=(m.Fact("clock", "by arrival"), m.Fact("height", "not stated")))
+    ring = SegmentRing(tmp_path, header(Config()), budget_mb=100)
+    for message in (origin(), said):
+        ring.write(message, 5)
+    ring.write(estimate(1, 0.0, 0.0), 10**15)  # far later: the next one begins
+    ring.close()
+    for name in ("flight-000.mcap", "flight-001.mcap"):
+        result = ReadResult()
+        assert said in read(tmp_path / name, result)
+        assert result.header["source"] == [["clock", "by arrival"], ["height", "not stated"]]
+    assert cut(tmp_path, tmp_path / "cut.mcap", 1.0, 1e9) == 2
+    assert read(tmp_path / "cut.mcap").count(said) == 1
+    page = provenance(FlightView(title="", rows=[], frame_ids=[], header=result.header))
+    assert "source, clock" in page and "by arrival" in page
 
 
 def test_a_standard_mcap_reader_opens_the_record_with_json_schemas(tmp_path: Path) -> None:

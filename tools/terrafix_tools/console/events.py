@@ -4,21 +4,35 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from terrafix_tools.console.payloads import CameraPose, Ellipse, FlightState, FragmentState, FrameResult, Gps
+from terrafix_tools.console.payloads import (
+    CameraPose,
+    Ellipse,
+    FlightState,
+    FragmentState,
+    FrameResult,
+    Gps,
+    WholeVerdict,
+)
 
 
 class Event(BaseModel):
     """Base class; the name of an event is that of its class in lower case with underscores (``name_of``)."""
 
 
+class OfFrame(Event):
+    """An event of one frame. ``file``: name of its image as it was uploaded; "" for that of a live camera."""
+
+    frame_id: int
+    file: str = ""
+
+
 class FrameProcessed(Event, FrameResult):
     """A frame has its immediate result."""
 
 
-class FrameRefined(Event, CameraPose):
+class FrameRefined(OfFrame, CameraPose):
     """Later frames, or the end of the flight, have moved a frame."""
 
-    frame_id: int
     gps: Gps
     refined: bool = True
     altitude: float | None
@@ -27,10 +41,9 @@ class FrameRefined(Event, CameraPose):
     fragment_id: int
 
 
-class SearchExpanded(Event):
+class SearchExpanded(OfFrame):
     """Lost: the search has reached another size. ``grid_size``: tiles, 1 to 25; None: the whole map."""
 
-    frame_id: int
     grid_size: int | None
     status: str  # "widen", "whole_map", "found"
 
@@ -43,11 +56,10 @@ class CandidateTile(BaseModel):
     half_size_m: float
 
 
-class UserInputNeeded(Event):
+class UserInputNeeded(OfFrame):
     """The whole map was searched: a user fix or a coarse hint is asked for. At most five tiles, the best first."""
 
     request_id: str
-    frame_id: int
     image_url: str
     candidate_tiles: list[CandidateTile]
 
@@ -55,41 +67,36 @@ class UserInputNeeded(Event):
 class ProcessingBlocked(Event):
     reason: str
     frame_id: int | None
+    file: str = ""
 
 
-class ChunkMerged(Event):
+class ChunkMerged(OfFrame):
     """A fragment is tied to the flight from ``frame_id`` on; one that begins joined, with its first frame."""
 
     fragment_id: int
-    frame_id: int
     frames: int  # of the fragment until then
 
 
-class FragmentChanged(Event):
+class FragmentChanged(OfFrame):
     """A fragment has begun, or its state has changed."""
 
     fragment_id: int
-    frame_id: int
     state: FragmentState
 
 
-class RecoveryStarted(Event):
+class RecoveryStarted(OfFrame):
     """The position is lost at this frame: a search begins."""
 
-    frame_id: int
 
-
-class RecoverySucceeded(Event):
+class RecoverySucceeded(OfFrame):
     """The search has found the position; ``frames``: since it was lost."""
 
-    frame_id: int
     frames: int
 
 
-class UserFixApplied(Event):
+class UserFixApplied(OfFrame):
     """A user fix has passed the gate and is in the graph. A refused one is a ``VerdictGiven`` with the reason."""
 
-    frame_id: int
     detail: str
 
 
@@ -98,10 +105,9 @@ class StateChanged(Event):
     previous: FlightState
 
 
-class VerdictGiven(Event):
+class VerdictGiven(OfFrame):
     """A measurement was rejected, or a map match was accepted."""
 
-    frame_id: int
     measurement: str
     verdict: str
     detail: str
@@ -128,9 +134,10 @@ class FinaliseProgress(Event):
 
 class FlightCompleted(Event):
     """``statistics``: frames, localised, refined, finalised, fragments, merged, hints; ``median_radius95_m``;
-    ``not_finalised``: why, else empty."""
+    ``not_finalised``: why, else empty. ``verdict``: on the whole flight; None: no service has seen all of it."""
 
     statistics: dict[str, Any]
+    verdict: WholeVerdict | None = None
 
 
 class Health(Event):

@@ -59,15 +59,13 @@ def upload(
     flight_id: FlightId,
     folder: Annotated[Path, typer.Argument(help="Folder of images, in the order of their names.")],
     telemetry: Annotated[Path | None, typer.Option(help="frames.csv with a row for each image.")] = None,
-    renumber: Annotated[bool, typer.Option("--renumber", help="Send them under numbers of their own.")] = False,
     url: UrlOption = URL,
 ) -> None:
     """Upload the images of a folder, in batches."""
     from terrafix_tools.console.new_flight import images_of, telemetry_of
 
     client = client_of(url)
-    first = client.flight(flight_id).images.next_number or 1
-    images = images_of(folder, first if renumber else None)
+    images = images_of(folder)
     rows = None if telemetry is None else telemetry_of(telemetry, images)
     done = 0
     for accepted in client.upload(flight_id, images, rows):

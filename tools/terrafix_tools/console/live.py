@@ -2,13 +2,13 @@
 
 One thread reads the bus as an observer. Its publishers drop what does not fit into its queue and never wait for it."""
 
+import json
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,9 @@ import msgspec
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import TerrafixError
+from terrafix.core.flight_id import live_flight_id
 from terrafix.core.frames import SharedFrameStore
+from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.messages import Frame, HintVerdict, MapMatch, Message, NavEstimate, Origin, Refinement, SearchPlaces
 from terrafix.processes import PROCESSES
 from terrafix.runtime.observer import Observer
@@ -26,9 +28,10 @@ from terrafix.runtime.run_spec import Spec
 from terrafix_tools.console.compute.observed import FlightObserver
 from terrafix_tools.console.compute.steering import fix_message
 from terrafix_tools.console.events import FlightCompleted
-from terrafix_tools.console.payloads import FlightState, Hint, UserFix
+from terrafix_tools.console.payloads import FlightState, Hint, Start, UserFix, WholeVerdict
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database
+from terrafix_tools.flight_verdict import verdict_of
 from terrafix_tools.hint.send import RADIUS_M
 from terrafix_tools.hint.send import hint as send_hint
 from terrafix_tools.log.edit import origin_of
@@ -59,6 +62,7 @@ class LiveRun:
     status: Status
     waiting: OrderedDict[int, list[Message]] = field(default_factory=OrderedDict)
     frames: int = 0
+    has_start: bool = False  # the record has told where it begins
 
 
 def run_to_follow(bus: str) -> RunDir | None:
@@ -71,7 +75,7 @@ def run_to_follow(bus: str) -> RunDir | None:
 
 def flight_id_of(run: RunDir) -> str:
     """The same for one run, whichever service follows it."""
-    return f"live-{sha256(f'{run.path}{run.epoch_ns}'.encode()).hexdigest()[:12]}"
+    return live_flight_id(run.epoch_ns or 0)
 
 
 class LiveFlights:
@@ -164,6 +168,7 @@ class LiveFlights:
                     self._take(live, messages)
                 if time.monotonic() >= next_health_s:
                     next_health_s = time.monotonic() + HEALTH_S
+                    self._read_start(live)
                     self.facts = facts(live.status, process_states(run, now_ns()), now_ns())
                     self._health(live.flight_id, self.facts)
         if not run.spec.exists():
@@ -174,7 +179,7 @@ class LiveFlights:
     def _begin(self, run: RunDir, spec: Spec) -> LiveRun:
         flight_id, epoch_ns = flight_id_of(run), run.epoch_ns
         observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image")
-        observer.origin_ns = epoch_ns or 0
+        observer.origin_ns, observer.flight_id = epoch_ns or 0, flight_id
         map_path = None if spec.map_path is None else Path(spec.map_path)
         with self._database.write() as db:
             flights.create_live(
@@ -187,6 +192,21 @@ class LiveFlights:
         live = LiveRun(run, flight_id, Path(spec.out_dir), map_path, observer, Status(now_ns()))
         live.observer.resume(self._state_of(flight_id))
         return live
+
+    def _read_start(self, live: LiveRun) -> None:
+        """Stores the start that the source of the run gave, as soon as the record has it."""
+        if live.has_start:
+            return
+        try:
+            origin = origin_of(live.out)
+        except TerrafixError:
+            return  # not written yet
+        live.has_start = True
+        if origin.start_sigma_m > SEARCH_START_SIGMA_M:
+            return  # the middle of the map, which is searched
+        start = Start(lat=origin.lat_deg, lon=origin.lon_deg, sigma_m=origin.start_sigma_m)
+        with self._database.write() as db:
+            flights.update(db, live.flight_id, spec=json.dumps({"start": start.model_dump()}))
 
     def _state_of(self, flight_id: str) -> FlightState:
         with self._database.read() as db:
@@ -236,11 +256,15 @@ class LiveFlights:
         self._stored(flight_id)
 
     def _complete(self, live: LiveRun) -> None:
+        try:
+            verdict = WholeVerdict.model_validate(verdict_of(live.out).as_json())
+        except TerrafixError:  # its record was moved, or was never written
+            verdict = None
         with self._database.write() as db:
             for of_frame in live.waiting.values():
                 live.observer.take(of_frame)
                 outcome = live.observer.frame_done()
                 assert outcome.result is not None
                 flights.store_outcome(db, live.flight_id, f"frame {outcome.result.frame_id}", outcome)
-            flights.complete(db, live.flight_id, live.observer.completed())
+            flights.complete(db, live.flight_id, live.observer.completed(verdict))
         self._stored(live.flight_id)

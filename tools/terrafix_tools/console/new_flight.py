@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.vision.sources.description import Description, read_description
 from terrafix.vision.sources.images import image_files
-from terrafix_tools.console.payloads import NewFlight
+from terrafix_tools.console.payloads import Camera, Mount, NewFlight, Telemetry
+from terrafix_tools.console.store.flights import order_of
 from terrafix_tools.mission.file import read_mission
 
 HEADER_CELL = "file"
@@ -25,11 +26,13 @@ def new_flight(
     read = read_description(description)
     if read.camera is None:
         raise SourceError(f"{description}: there is no [camera]; add one with width, height, fx, fy, cx, cy in pixels")
+    if read.camera.model != "pinhole":
+        raise SourceError(f"{description}: camera.model {read.camera.model}: the console takes pinhole cameras only")
     given = {
         "name": name or read.name,
-        "camera": _without(read.camera, "model"),
-        "mount": _without(read.mount, "gimbal", "gimbal_device", "stabilised"),
-        "telemetry": _without(read.telemetry, "tlog_t0_us", "log_zero_s"),
+        "camera": _taken(read.camera, Camera),
+        "mount": _taken(read.mount, Mount),
+        "telemetry": _taken(read.telemetry, Telemetry),
         "start": _start(read),
         "map": map_name or None,
         "area": None if mission is None else {"waypoints": _waypoints(mission), "corridor_m": corridor_m},
@@ -57,16 +60,13 @@ def _waypoints(mission: Path) -> list[dict[str, float]]:
     return [{"lat": lat, "lon": lon} for lat, lon in ([home] if home != (0.0, 0.0) else []) + placed]
 
 
-def images_of(folder: Path, first: int | None) -> list[tuple[str, Path]]:
-    """Names and files of the images of a folder, in the order of their names. ``first``: they get numbers from there;
-    None: names are as they are. Raises SourceError."""
+def images_of(folder: Path) -> list[tuple[str, Path]]:
+    """Names and files of the images of a folder, in the order of their names. Raises SourceError."""
     try:
         paths = image_files(folder)
     except OSError as error:
         raise SourceError(f"{folder}: cannot be read ({error.strerror})") from None
-    if first is None:
-        return [(path.name, path) for path in paths]
-    return [(f"image-{number:06d}{path.suffix}", path) for number, path in enumerate(paths, start=first)]
+    return sorted(((path.name, path) for path in paths), key=lambda image: order_of(image[0]))
 
 
 def telemetry_of(table: Path, images: list[tuple[str, Path]]) -> dict[str, str]:
@@ -84,6 +84,6 @@ def telemetry_of(table: Path, images: list[tuple[str, Path]]) -> dict[str, str]:
     return {"": lines[0], **{name: f"{name},{rows[path.name]}" for name, path in images}}
 
 
-def _without(table: msgspec.Struct, *keys: str) -> dict[str, Any]:
-    """A table of the description without what images alone do not need."""
-    return {key: value for key, value in msgspec.to_builtins(table).items() if key not in keys}
+def _taken(table: msgspec.Struct, body: type[BaseModel]) -> dict[str, Any]:
+    """What images alone need of a table of the description."""
+    return {key: value for key, value in msgspec.to_builtins(table).items() if key in body.model_fields}

@@ -40,10 +40,12 @@ class Ellipse(BaseModel):
 
 
 class CameraPose(BaseModel):
-    """A refined camera, beside its position. ``orientation``: quaternion w, x, y, z in east, north, up; ``covariance``:
-    36 numbers, row by row, of position [m], then rotation [rad] about east, north, up; ``m_per_unit``: metres of a unit
-    of odometry in the submap of the frame. None: not refined."""
+    """A camera, beside its position. ``frame_uid``: unique over all flights. The others are refined; None: not refined.
+    ``orientation``: quaternion w, x, y, z in east, north, up; ``covariance``: 36 numbers, row by row, of position [m],
+    then rotation [rad] about east, north, up; ``m_per_unit``: metres of a unit of odometry in the submap of the
+    frame."""
 
+    frame_uid: str = ""
     orientation: list[float] | None = None
     covariance: list[float] | None = None
     m_per_unit: float | None = None
@@ -103,11 +105,12 @@ class Start(Strict):
 
 
 class Telemetry(Strict):
-    """1-sigma of the headings, heights and attitudes of the images, as [telemetry] of a flight folder."""
+    """1-sigma of the headings, heights and attitudes of the images, as [telemetry] of a flight folder.
+    ``attitude_sigma_deg`` None: that of what states them, photos or a table."""
 
     yaw_sigma_deg: Annotated[float, Field(gt=0, le=360)] = 5.0
     agl_sigma_m: Annotated[float, Field(gt=0, le=10_000)] = 5.0
-    attitude_sigma_deg: Annotated[float, Field(gt=0, le=180)] = 2.0
+    attitude_sigma_deg: Annotated[float, Field(gt=0, le=180)] | None = None
 
 
 class Waypoint(Strict):
@@ -123,8 +126,9 @@ class RouteArea(Strict):
 
 
 class NewFlight(Strict):
-    """``map``: name of a map of the service, or ``area``. ``height_m``: above ground, for images that state none.
-    Without ``start`` the first position is searched on the whole map."""
+    """``map``: name of a map of the service, or ``area``. ``height_m``: above ground, and ``yaw_deg``: heading, for
+    images that state none; for all with ``override``. ``images``: how many the flight has; when they are computed it
+    completes by itself, or asks for a position. Without ``start`` the first position is searched on the whole map."""
 
     name: Annotated[str, Field(max_length=MAX_NAME)] = ""
     camera: Camera
@@ -134,13 +138,40 @@ class NewFlight(Strict):
     map: Annotated[str, Field(min_length=1, max_length=MAX_NAME)] | None = None
     area: RouteArea | None = None
     height_m: Annotated[float, Field(gt=0, le=20_000)] | None = None
-    yaw_deg: Degrees | None = None  # heading for images that state none
+    yaw_deg: Degrees | None = None
+    override: bool = False
+    images: Annotated[int, Field(ge=1, le=20_000)] | None = None
 
     @model_validator(mode="after")
     def _has_one_map(self) -> "NewFlight":
         if (self.map is None) == (self.area is None):
             raise ValueError("give either map or area")
         return self
+
+
+class PhotoFact(BaseModel):
+    """``topic``: lens, mount, start, height, clock, ...; ``text``: what, and from where."""
+
+    topic: str
+    text: str
+
+
+class PhotoFacts(BaseModel):
+    """What photos state of a flight, with a flight.toml beside them, as `terrafix replay` takes it. ``camera`` None: no
+    photo states its focal length, ``problem`` says why. ``height_m``, ``yaw_deg``: of the first photo."""
+
+    width: int
+    height: int
+    camera: Camera | None
+    mount: Mount
+    telemetry: Telemetry
+    start: Start | None
+    height_m: float | None
+    yaw_deg: float | None
+    name: str
+    map: str  # stem of the one that flight.toml names
+    facts: list[PhotoFact]
+    problem: str = ""
 
 
 class MapState(StrEnum):
@@ -156,11 +187,12 @@ class FlightMap(BaseModel):
 
 
 class Images(BaseModel):
-    """``next_number``: that of the next image in the sequence of names; None: any."""
+    """``expected``: how many the flight has, as far as its creation said it; ``last_name``: of the newest image."""
 
     uploaded: int
     processed: int
-    next_number: int | None
+    expected: int | None = None
+    last_name: str | None = None
 
 
 class FragmentState(StrEnum):
@@ -189,8 +221,20 @@ class InputRequest(BaseModel):
     frame_id: int
 
 
+class WholeVerdict(BaseModel):
+    """On a completed flight, as summary.json has it. ``trusted_s``: from and to, seconds; ``trusted_files``: first and
+    last image of each of these spans; ``reasons``: why the rest cannot be trusted; ``cause``: the likely one."""
+
+    verdict: str  # "trust it", "trust it in part", "do not trust it"
+    trusted_s: list[tuple[float, float]]
+    trusted_files: list[tuple[str, str]]
+    trusted_share: float
+    reasons: list[str]
+    cause: str = ""
+
+
 class Flight(BaseModel):
-    """``start``: that of its creation."""
+    """``start``: that of its creation, or of the source of a live flight. ``verdict``: None before its end."""
 
     flight_id: str
     name: str
@@ -203,6 +247,7 @@ class Flight(BaseModel):
     images: Images
     fragments: list[Fragment]
     request: InputRequest | None
+    verdict: WholeVerdict | None = None
     events_url: str
     last_event_id: int
     error: str = ""  # why the flight cannot be processed
@@ -227,7 +272,6 @@ class Accepted(BaseModel):
 
     frames: list[int]
     repeated: bool
-    next_number: int
 
 
 class FrameResult(CameraPose):

@@ -19,6 +19,7 @@ from terrafix_tools.console.payloads import (
     NewFlight,
     ObjectGps,
     ObjectPixel,
+    PhotoFacts,
     Problem,
     Recordings,
     Results,
@@ -28,6 +29,7 @@ from terrafix_tools.console.payloads import (
     Tokens,
     UserFix,
 )
+from terrafix_tools.console.photo_facts import photo_facts
 from terrafix_tools.console.problems import Refusal
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.store import flights
@@ -141,7 +143,7 @@ UPLOAD_BODY = {
                             "minItems": 10,
                             "maxItems": 50,
                             "items": {"type": "string", "format": "binary"},
-                            "description": "JPEG or PNG, in the sequence of the numbers at the end of their names",
+                            "description": "JPEG or PNG, in the order of their names",
                         },
                         "telemetry": {
                             "type": "string",
@@ -156,10 +158,52 @@ UPLOAD_BODY = {
 }
 
 
+PHOTOS_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["images"],
+                    "properties": {
+                        "images": {
+                            "type": "array",
+                            "maxItems": 50,
+                            "items": {"type": "string", "format": "binary"},
+                            "description": "the first 256 kB of each photo",
+                        },
+                        "description": {"type": "string", "format": "binary", "description": "flight.toml"},
+                    },
+                }
+            }
+        },
+    }
+}
+
+
 @router.post("/flights/{flight_id}/images/batch", status_code=202, openapi_extra=UPLOAD_BODY)
 async def upload(request: Request, flight_id: FlightId) -> Accepted:
     """10 to 50 images, all of them or none. The same batch again gives the same answer."""
     return await service_of(request).upload(request, flight_id)
+
+
+@router.post("/photos", openapi_extra=PHOTOS_BODY)
+async def photos(request: Request) -> PhotoFacts:
+    """What photos state of their flight, and where each number comes from: for the form of a new flight."""
+    return await photo_facts(request, service_of(request).settings.limits)
+
+
+@router.post("/flights/{flight_id}/copy", status_code=201)
+async def copy(request: Request, flight_id: FlightId, new: NewFlight) -> Flight:
+    """A new flight with the images and hints of this one, computed with other settings, or the same again."""
+    return await service_of(request).copy(flight_id, new)
+
+
+@router.post("/flights/{flight_id}/retry", status_code=202)
+async def retry(request: Request, flight_id: FlightId, _nothing: Annotated[None, Body()] = None) -> Flight:
+    """A flight with an ``error`` goes on: map and images are read again."""
+    return await service_of(request).retry(flight_id)
 
 
 @router.get("/flights/{flight_id}/config")

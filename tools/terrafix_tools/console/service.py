@@ -41,7 +41,7 @@ from terrafix_tools.console.payloads import (
     Steered,
     UserFix,
 )
-from terrafix_tools.console.problems import Refusal
+from terrafix_tools.console.problems import FULL, Refusal
 from terrafix_tools.console.settings import Settings
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database
@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     from terrafix_tools.console.live import LiveFlights
 
 RECORDING = re.compile(r"[a-z0-9-]+\.(mcap|csv|json)(\.partial)?")
+USED_NEXT = "used with the next frame; hint_answered tells what came of it"
+USED_BY_COPY = "all images are computed; it is used with the next images, or when the flight is computed again"
 MEDIA_TYPES = {".jpg": "image/jpeg", ".png": "image/png"}
 
 
@@ -202,6 +204,35 @@ class Service:
         await self._wake(flight_id)
         return accepted
 
+    async def copy(self, flight_id: str, new: NewFlight) -> Flight:
+        """A new flight with the images and hints of another one."""
+        old = await asyncio.to_thread(self.flight, flight_id)
+        if old.kind is FlightKind.LIVE or old.images.uploaded == 0:
+            raise Refusal(409, "the flight has no images to copy")
+        made = await self.create(new.model_copy(update={"images": old.images.uploaded}))
+        folders = self.settings.flight(flight_id), self.settings.flight(made.flight_id)
+        try:
+            await asyncio.to_thread(uploads.copy_images, self.database, flight_id, made.flight_id, new, folders)
+        except OSError as error:
+            await self.delete(made.flight_id)
+            raise Refusal(FULL, f"the images cannot be copied ({error.strerror})") from None
+        await self._wake(made.flight_id)
+        return await asyncio.to_thread(self.flight, made.flight_id)
+
+    async def retry(self, flight_id: str) -> Flight:
+        def store() -> Flight:
+            with self.database.write() as db:
+                return flights.retry(db, flight_id)
+
+        flight = await asyncio.to_thread(store)
+        self.workers.forgive(flight_id)
+        await self.feeds.refresh(flight_id)
+        for preparing, area in await asyncio.to_thread(self._maps_to_make):
+            if preparing == flight_id:
+                self._areas.begin(flight_id, area)
+        await self._wake(flight_id)
+        return flight
+
     async def steer(self, flight_id: str, given: Hint | UserFix) -> Steered:
         flight = await asyncio.to_thread(self.flight, flight_id)
         if flight.kind is FlightKind.LIVE and self.live is not None:
@@ -219,7 +250,8 @@ class Service:
 
         hint_id = await asyncio.to_thread(add)
         await self.feeds.refresh(flight_id)
-        return Steered(hint_id=hint_id, detail="used with the next frame; hint_answered tells what came of it")
+        through = flight.images.processed >= flight.images.uploaded
+        return Steered(hint_id=hint_id, detail=USED_BY_COPY if through else USED_NEXT)
 
     async def locate(self, flight_id: str, frame_id: int, pixel: ObjectPixel) -> ObjectGps:
         answer = await self._locating.ask(await asyncio.to_thread(self._question, flight_id, frame_id, pixel))

@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -41,7 +41,8 @@ from terrafix_tools.console.store.database import Database
 from terrafix_tools.console.store.flights import StoredImage
 
 IMAGES, TELEMETRY = "images", "telemetry"  # names of the parts
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._()-]{0,99}")
+DESCRIPTION = "description"  # a flight.toml, of POST /photos
+NAME = re.compile(r"[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]{0,199}")
 # First bytes of what is taken, with the suffix that the stored file gets: the name that was sent decides nothing.
 FORMATS = {b"\xff\xd8\xff": ".jpg", b"\x89PNG\r\n\x1a\n": ".png"}
 HEADER_BYTES = 256 * 1024  # of an image that are read for its size: EXIF with a thumbnail is before it [spec: < 64 kB]
@@ -91,15 +92,15 @@ class _Reader:
         field = options.get(b"name", b"").decode("utf-8", errors="replace")
         name = options.get(b"filename", b"").decode("utf-8", errors="replace")
         self._disposition = ""
-        if field not in (IMAGES, TELEMETRY):
+        if field not in (IMAGES, TELEMETRY, DESCRIPTION):
             raise Refusal(422, f"a part is named {field[:40]!r}; send '{IMAGES}' for each image, and '{TELEMETRY}'")
         most = self._limits.batch[1]
         if field == IMAGES and sum(part.field == IMAGES for part in self.parts) == most:
             raise Refusal(422, f"more than {most} images; send them in batches")
-        if field == TELEMETRY and any(part.field == TELEMETRY for part in self.parts):
-            raise Refusal(422, f"two parts '{TELEMETRY}'; send one table")
+        if field != IMAGES and any(part.field == field for part in self.parts):
+            raise Refusal(422, f"two parts '{field}'; send one")
         if field == IMAGES and not NAME.fullmatch(name):
-            raise Refusal(422, f"{name[:100]!r} is no name of an image; use letters, digits, '-', '_' and '.'")
+            raise Refusal(422, f"{name[:100]!r} is no name of an image; it has no '/', and begins with no '.'")
         part = Part(field, name, self._folder / str(len(self.parts)))
         self.parts.append(part)
         self._file, self._sum = part.path.open("wb"), hashlib.sha256()
@@ -211,13 +212,13 @@ def store_batch(database: Database, flight_id: str, folder: Path, parts: list[Pa
     if not least <= len(images) <= most:
         raise Refusal(422, f"{len(images)} images; a batch has {least} to {most}, sent as parts '{IMAGES}'")
     names = [part.name for part in images]
-    flights.check_sequence(None, names)
+    flights.check_order(None, names)
     with database.read() as db:
         row = flights.row_of(db, flight_id)
         new = NewFlight.model_validate_json(row.spec)
         known = flights.repeated_batch(db, flight_id, [(part.name, part.sha256) for part in images])
     if known is not None:
-        return Accepted(frames=known, repeated=True, next_number=row.last_number + 1)
+        return Accepted(frames=known, repeated=True)
     suffixes = [check_image(part, new) for part in images]
     table = next((part for part in parts if part.field == TELEMETRY), None)
     rows = None if table is None else _telemetry(table, names)
@@ -237,7 +238,7 @@ def store_batch(database: Database, flight_id: str, folder: Path, parts: list[Pa
                 raise Refusal(409, "the flight is being completed; create another one")
             if row.error:
                 raise Refusal(409, f"the flight cannot go on: {row.error}")
-            last_number = flights.check_sequence(row.last_number, names)
+            flights.check_order(flights.last_name(db, flight_id), names)
             first = flights.image_count(db, flight_id)
             if first + len(images) > limits.images:
                 raise Refusal(409, f"a flight has at most {limits.images} images; complete it and create another one")
@@ -259,7 +260,7 @@ def store_batch(database: Database, flight_id: str, folder: Path, parts: list[Pa
                 text = None if state is None else msgspec.json.encode(state).decode()
                 batch.append(StoredImage(frame_id, part.name, stored, part.bytes, part.sha256, t_ns, text))
             flush_to_disk(folder / IMAGES)
-            return flights.add_images(db, flight_id, batch, last_number)
+            return flights.add_images(db, flight_id, batch)
     except OSError as error:
         raise Refusal(FULL, f"the upload cannot be stored ({error.strerror})") from None
 
@@ -314,7 +315,7 @@ def _state(info: PhotoInfo | None, t_ns: int) -> VehicleState | None:
 
 
 def _completed(state: VehicleState | None, new: NewFlight, t_ns: int) -> VehicleState | None:
-    """``state`` with height and heading of the flight where the image has none."""
+    """``state`` with height and heading of the flight where the image has none, or where they override it."""
     agl_m = new.height_m
     yaw_rad = None if new.yaw_deg is None else math.remainder(math.radians(new.yaw_deg), math.tau)
     if state is None:
@@ -323,9 +324,27 @@ def _completed(state: VehicleState | None, new: NewFlight, t_ns: int) -> Vehicle
         return VehicleState(t_ns=t_ns, source="operator", agl_m=agl_m, yaw_rad=yaw_rad)
     return msgspec.structs.replace(
         state,
-        agl_m=state.agl_m if state.agl_m is not None else agl_m,
-        yaw_rad=state.yaw_rad if state.yaw_rad is not None else yaw_rad,
+        agl_m=agl_m if agl_m is not None and (new.override or state.agl_m is None) else state.agl_m,
+        yaw_rad=yaw_rad if yaw_rad is not None and (new.override or state.yaw_rad is None) else state.yaw_rad,
     )
+
+
+def copy_images(database: Database, flight_id: str, to: str, new: NewFlight, folders: tuple[Path, Path]) -> None:
+    """Gives the images of a flight, and its hints, to another one that has none. ``folders``: of both. Files are
+    linked: they are never written again."""
+    source, target = folders
+    (target / IMAGES).mkdir(parents=True, exist_ok=True)
+    with database.write() as db:
+        found = flights.images_of(db, flight_id, 0, flights.image_count(db, flight_id) + 1)
+        copies = []
+        for image in found:
+            state = None if image.state is None else msgspec.json.decode(image.state, type=VehicleState)
+            state = _completed(state, new, image.t_ns)
+            text = None if state is None else msgspec.json.encode(state).decode()
+            os.link(source / image.stored, target / image.stored)
+            copies.append(replace(image, state=text, attempts=0))
+        flights.add_images(db, to, copies)
+        flights.copy_hints(db, flight_id, to)
 
 
 class Slots:

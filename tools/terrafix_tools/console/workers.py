@@ -72,6 +72,10 @@ class Workers:
         self._queue[flight_id] = map_path
         await self._start_next()
 
+    def forgive(self, flight_id: str) -> None:
+        """The deaths of its processes do not count any more."""
+        self._deaths.pop(flight_id, None)
+
     async def end(self, flight_id: str) -> None:
         """The flight is deleted."""
         self._queue.pop(flight_id, None)

@@ -74,7 +74,7 @@ def rectify(
         if shrink not in blurred:
             blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
         source = blurred[shrink]
-    if camera.distortion or camera.radial_k1:
+    if camera.distortion or camera.radial_k1 or camera.readout is not None:
         px = _lens_map(camera, to_camera, width, height)
         flat = cv2.remap(source, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
         mask = (px >= 0).all(-1) & (px[..., 0] <= camera.width - 1) & (px[..., 1] <= camera.height - 1)

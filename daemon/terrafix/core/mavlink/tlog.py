@@ -10,10 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink  # common has no CAMERA_FEEDBACK
 
 from terrafix.core.errors import SourceError
-from terrafix.core.mavlink import gimbal
+from terrafix.core.exposures import EXPOSURE_KINDS
+from terrafix.core.mavlink import exposure, gimbal
 from terrafix.core.mavlink.airspeed import AirspeedReader
 from terrafix.core.mavlink.gimbal import GimbalReader
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
@@ -132,6 +133,22 @@ class TelemetryLog:
         reader = GimbalReader()
         timed = ((message, (t_us - self.t0_us) * 1000) for t_us, message in self.messages(gimbal.MESSAGE_IDS))
         return [attitude for one in timed if (attitude := reader.take(*one)) is not None]
+
+    @cached_property
+    def exposures(self) -> dict[str, list[int]]:
+        """Times of the exposures of each kind, the preferred one first, in order. With the time of the autopilot's
+        clock they are as far apart as on it, and arrive as the fastest of them."""
+        found: dict[str, list[tuple[int, int | None]]] = {kind: [] for kind in EXPOSURE_KINDS}
+        for t_us, message in self.messages(exposure.EXPOSURE_MESSAGE_IDS):
+            if (read := exposure.exposure_of(message)) is not None:
+                found[read[0]].append(((t_us - self.t0_us) * 1000, read[2]))
+        times: dict[str, list[int]] = {}
+        for kind, of_kind in found.items():
+            late_ns = min((arrived - boot for arrived, boot in of_kind if boot is not None), default=0)
+            at_ns = {arrived if boot is None else boot + late_ns for arrived, boot in of_kind}
+            if at_ns:
+                times[kind] = sorted(at_ns)
+        return times
 
     def notes(self) -> list[str]:
         """Which vehicle was chosen and what was repaired, in words."""

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.estimator.integrity.offset_drift import STEP_S
-from terrafix.estimator.integrity.time_offset import INDEPENDENT_COMPARISON_SHARE, REPORT_WAIT_NS, UNSTAMPED_SHARE
+from terrafix.estimator.integrity.time_offset import REPORT_WAIT_NS, UNSTAMPED_SHARE
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import STAMP_SIGMA_S
 
 TURN_GRID_S = np.arange(-2.0, 2.0001, STEP_S)  # s: offsets of the density [spec: offset_drift.py, to 2 s both ways]
 MIN_COMPARED_TURN_SIGMA_RAD = np.radians(0.3)  # lower limit of the 1-sigma of a turn between two frames [tuned]
 MOUNT_PITCH_SIGMA_RAD = np.radians(1.5)  # 1-sigma of the mount pitch that remains after its calibration [tuned]
+INDEPENDENT_TURN_SHARE = 0.5  # of the turns: two consecutive ones share a frame [tuned]
 MEMORY_TURNS = 300.0  # turns: time constant of the exponential forgetting of the sums [tuned]
 
 
@@ -64,7 +65,7 @@ class TurnComparison:
         independent = self._turned2 / self._count + MIN_COMPARED_TURN_SIGMA_RAD**2
         log = self._log_likelihood(self._noise) - self._log_likelihood(independent)
         total = float(log.max() + np.log(prior / prior.sum() @ np.exp(log - log.max())))
-        return total, total / (0.5 * INDEPENDENT_COMPARISON_SHARE * self._count)
+        return total, total / (0.5 * INDEPENDENT_TURN_SHARE * self._count)
 
     @property
     def _noise(self) -> np.ndarray:
@@ -75,7 +76,7 @@ class TurnComparison:
 
     def _log_likelihood(self, variance: np.ndarray) -> np.ndarray:
         """Of the turns so far, whose ``variance`` is that of their own mean square."""
-        return np.asarray(-0.5 * INDEPENDENT_COMPARISON_SHARE * self._count * np.log(variance))
+        return np.asarray(-0.5 * INDEPENDENT_TURN_SHARE * self._count * np.log(variance))
 
     def _accumulate(self, turn: Turn, telemetry: Telemetry) -> None:
         shift_ns = np.round(TURN_GRID_S * 1e9).astype(np.int64)

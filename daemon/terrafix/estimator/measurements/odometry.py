@@ -22,7 +22,7 @@ from terrafix.estimator.measurements.telemetry_buffer import UNKNOWN_ATTITUDE_RA
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
-from terrafix.estimator.state import HEADING, HEIGHT, HORIZONTAL, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
+from terrafix.estimator.state import HEADING, HEIGHT, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import CovarianceMode, Odometry, Verdict
 
 # Verdicts on frames without a new view of the ground.
@@ -110,7 +110,7 @@ class OdometryMeasurement:
             wrong = not innovation.is_accepted or state.orientation.fault is not None
             if frozen or wrong or self._is_flipped(answer, frame, before, motion):
                 verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
-                state.image_jump = None if frozen else (t_s, motion.residual_m[HORIZONTAL])
+                state.image_jump = None if frozen else (t_s, motion.horizontal)
                 return GatedOdometry(verdict, None, alone, innovation=innovation, motion_innovation=motion)
             if not fragment.confirmed:
                 self._weigh_fragment(fragment, frame, answer, before, motion)

@@ -75,7 +75,7 @@ class MjpegCapture:
         size = stated_size(self._jpeg) if self._jpeg.startswith(JPEG_HEAD) else None
         if size is None or size[0] * size[1] > MAX_PIXELS:
             return False, None
-        image = cv2.imdecode(np.frombuffer(self._jpeg, np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(self._jpeg, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         return image is not None, image
 
     def stamp(self, arrival_ns: int) -> Stamp:

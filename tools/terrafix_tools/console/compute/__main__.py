@@ -6,6 +6,7 @@ input wakes it; the end of the input ends it."""
 
 import argparse
 import fcntl
+import json
 import os
 import resource
 import signal
@@ -26,11 +27,12 @@ from terrafix_tools.console.compute.packets import Begin
 from terrafix_tools.console.compute.source import Upload, UploadedImages
 from terrafix_tools.console.compute.steering import fix_message, hint_message
 from terrafix_tools.console.events import FinaliseProgress
-from terrafix_tools.console.payloads import Hint, UserFix
+from terrafix_tools.console.payloads import Hint, UserFix, WholeVerdict
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database, open_database
 from terrafix_tools.finalised import read_poses
 from terrafix_tools.replay import replay
+from terrafix_tools.replay_output import SUMMARY
 
 PROGRESS_STEPS = 10  # events of a stage of finalise [spec: docs/console.md]
 
@@ -82,8 +84,10 @@ class FlightProcess:
 
     def complete(self) -> None:
         not_finalised = self._finalise()
+        summary = json.loads((self._folder / "out" / SUMMARY).read_bytes())
+        verdict = WholeVerdict.model_validate(summary["verdict"])
         with self._database.write() as db:
-            flights.complete(db, self._flight_id, self._observer.completed(not_finalised))
+            flights.complete(db, self._flight_id, self._observer.completed(verdict, not_finalised))
         self._say("stored")
 
     def _finalise(self) -> str:
@@ -119,9 +123,18 @@ class FlightProcess:
     def _wait(self) -> None:
         if (outcome := self._observer.images_through()) is not None and outcome.request is not None:
             self._store(f"asked {outcome.request.request_id}", outcome)
+        elif not self._observer.asks and self._has_all_images():
+            with self._database.write() as db:
+                flights.update(db, self._flight_id, completing=True)
+            return
         self._say("waiting")
         if not sys.stdin.readline():
             raise SystemExit(0)
+
+    def _has_all_images(self) -> bool:
+        with self._database.read() as db:
+            count = flights.image_count(db, self._flight_id)
+        return self.source.new.images is not None and count >= self.source.new.images
 
     def _steer(self, hint_id: int, given: Hint | UserFix, t_ns: int) -> PositionHint | None:
         t_ns += hint_id  # nanoseconds: the answer names a hint by its time

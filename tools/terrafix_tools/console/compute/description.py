@@ -25,10 +25,11 @@ def stored_camera(new: NewFlight) -> Camera:
     return camera_of(WHERE, _description(new))
 
 
-def origin(new: NewFlight) -> Origin:
-    """The Origin of the flight, with the camera of the images as they are read. Raises SourceError."""
+def origin(new: NewFlight, attitude_sigma_deg: float) -> Origin:
+    """The Origin of the flight, with the camera of the images as they are read. ``attitude_sigma_deg``: where the
+    flight does not state it. Raises SourceError."""
     description = _description(new)
-    return origin_of(description, downscaled_camera(camera_of(WHERE, description)), None)
+    return origin_of(description, downscaled_camera(camera_of(WHERE, description)), None, attitude_sigma_deg)
 
 
 def stored_pixel(u: float, v: float, new: NewFlight) -> tuple[float, float]:

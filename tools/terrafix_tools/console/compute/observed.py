@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from terrafix.core.flight_id import frame_uid
 from terrafix.core.gate import CHI2_95
 from terrafix.core.log_lines import SEARCHING_STEPS
 from terrafix.link.ground_station.prior_request import MIN_FRAMES
@@ -33,6 +34,7 @@ from terrafix_tools.console.events import (
     FrameProcessed,
     FrameRefined,
     HintAnswered,
+    OfFrame,
     ProcessingBlocked,
     RecoveryStarted,
     RecoverySucceeded,
@@ -50,6 +52,7 @@ from terrafix_tools.console.payloads import (
     FrameResult,
     Gps,
     InputRequest,
+    WholeVerdict,
 )
 from terrafix_tools.estimates import yaw_deg_of
 from terrafix_tools.finalised import FinalRow
@@ -90,7 +93,7 @@ class FlightObserver:
         self._image_url = image_url
         self.estimates: dict[int, NavEstimate] = {}  # the last one of each frame
         self.hints: dict[int, int] = {}  # id of each hint that was given, by its t_ns
-        self.origin_ns = 0
+        self.origin_ns, self.flight_id = 0, ""
         self._fragments: dict[int, Fragment] = {}
         self._state = FlightState.PROCESSING
         self._asked = False
@@ -107,6 +110,7 @@ class FlightObserver:
         self._refined: list[FrameRefined] = []
         self._scales: dict[int, float] = {}  # by frame: metres per unit, of the newest refinement that states them
         self._frame_of: dict[str, int] = {}  # by file
+        self._file_of: dict[int, str] = {}  # by frame
         self._finalised = 0
 
     def resume(self, state: FlightState) -> None:
@@ -119,10 +123,10 @@ class FlightObserver:
         for message in messages:
             match message:
                 case Origin():
-                    self.origin_ns = message.t_ns
+                    self.origin_ns, self.flight_id = message.t_ns, message.flight_id
                 case Frame():
                     self._shown, self._match = message, None
-                    self._frame_of[message.file] = message.frame_id
+                    self._frame_of[message.file], self._file_of[message.frame_id] = message.frame_id, message.file
                 case NavEstimate():
                     self.estimates[message.frame_id] = message
                 case MapMatch():
@@ -146,6 +150,7 @@ class FlightObserver:
         assert shown is not None
         estimate, found = self.estimates.get(shown.frame_id), self._match
         result = _result(shown, estimate, found, self.origin_ns)
+        result.frame_uid = frame_uid(self.flight_id, shown.frame_id)
         events: list[Event] = [FrameProcessed(**result.model_dump())]
         fragment = None
         if estimate is not None and estimate.fragment_id >= 0:
@@ -162,6 +167,11 @@ class FlightObserver:
             outcome.heading = result.heading, math.degrees(math.sqrt(max(estimate.cov[35], 0.0)))
         return outcome
 
+    @property
+    def asks(self) -> bool:
+        """A position was asked for, and none has helped yet."""
+        return self._asked
+
     def rest(self) -> FrameOutcome:
         """What messages without a frame add: those after the source has ended."""
         return self._outcome([])
@@ -176,10 +186,12 @@ class FlightObserver:
     def _refined_frame(self, pose: RefinedPose, source: str) -> FrameRefined:
         if pose.m_per_unit is not None:
             self._scales[pose.frame_id] = pose.m_per_unit
-        return _refined(pose, source, self._scales.get(pose.frame_id))
+        refined = _refined(pose, source, self._scales.get(pose.frame_id))
+        refined.frame_uid = frame_uid(self.flight_id, pose.frame_id)
+        return refined
 
-    def completed(self, not_finalised: str = "") -> FlightCompleted:
-        """``not_finalised``: why the flight has no solution as a whole."""
+    def completed(self, verdict: WholeVerdict | None = None, not_finalised: str = "") -> FlightCompleted:
+        """``verdict``: on the flight, None: it has no record; ``not_finalised``: why it has no solution as a whole."""
         totals = self._totals
         median = float(np.median(totals.radii_m)) if totals.radii_m else None
         return FlightCompleted(
@@ -193,11 +205,15 @@ class FlightObserver:
                 "hints": totals.hints,
                 "median_radius95_m": None if median is None else round(median, 2),
                 "not_finalised": not_finalised,
-            }
+            },
+            verdict=verdict,
         )
 
     def _outcome(self, events: list[Event]) -> FrameOutcome:
         events = [*events, *self._others, *self._refined]
+        for event in events:
+            if isinstance(event, (OfFrame, ProcessingBlocked)) and event.frame_id is not None:
+                event.file = self._file_of.get(event.frame_id, "")
         self._totals.refined |= {refined.frame_id for refined in self._refined}
         outcome = FrameOutcome(refined=self._refined, events=events, state=self._state, request=self._request)
         self._others, self._refined = [], []

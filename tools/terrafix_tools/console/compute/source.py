@@ -7,7 +7,9 @@ import msgspec
 
 from terrafix.messages import Frame, Origin, PositionHint, VehicleState
 from terrafix.vision.sources import Shot
+from terrafix.vision.sources.description import ATTITUDE_SIGMA_DEG
 from terrafix.vision.sources.images import read_image
+from terrafix.vision.sources.photos import STATED_TILT_SIGMA_DEG
 from terrafix_tools.console.compute.description import origin, stored_camera
 from terrafix_tools.console.payloads import Hint, NewFlight, UserFix
 from terrafix_tools.console.store import flights
@@ -57,7 +59,11 @@ class UploadedImages:
         self._wait, self._begins, self._steer = wait, begins, steer
         with database.read() as db:
             self.new = NewFlight.model_validate_json(flights.row_of(db, flight_id).spec)
-        self._origin, self.stored = origin(self.new), stored_camera(self.new)
+            states = [self._state(image) for image in flights.images_of(db, flight_id, 0, 1)]
+        by_photos = any(state is not None and state.source == "exif" for state in states)
+        stated = origin(self.new, STATED_TILT_SIGMA_DEG if by_photos else ATTITUDE_SIGMA_DEG)
+        self._origin = msgspec.structs.replace(stated, flight_id=flight_id)
+        self.stored = stored_camera(self.new)
 
     def origin(self) -> Origin:
         return self._origin
@@ -105,8 +111,12 @@ class UploadedImages:
             height=camera.height,
             error=POISONED if poisoned else "",
         )
-        state = None if image.state is None else msgspec.json.decode(image.state, type=VehicleState)
-        return Upload(frame, "" if poisoned else str(self._folder / image.stored), state, self._hints(image))
+        path = "" if poisoned else str(self._folder / image.stored)
+        return Upload(frame, path, self._state(image), self._hints(image))
+
+    @staticmethod
+    def _state(image: StoredImage) -> VehicleState | None:
+        return None if image.state is None else msgspec.json.decode(image.state, type=VehicleState)
 
     def _hints(self, image: StoredImage) -> tuple[PositionHint, ...]:
         with self._database.read() as db:

@@ -12,7 +12,7 @@ from terrafix.core.errors import OutputError
 from terrafix_tools.console.store import schema
 
 FILE = "console.sqlite"
-EARLIER = (0, 1)  # versions of tables that are brought up to date; 0: none, or of the time before versions
+EARLIER = (0, 1, 2)  # versions of tables that are brought up to date; 0: none, or of the time before versions
 BUSY_MS = 10_000  # time-out of a write that waits for that of another process
 
 

@@ -2,10 +2,11 @@
 
 import json
 import re
-import secrets
+import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import pairwise
 
 import sqlalchemy as sa
 from sqlalchemy.dialects.sqlite import insert
@@ -28,13 +29,14 @@ from terrafix_tools.console.payloads import (
     NewFlight,
     RouteArea,
     UserFix,
+    WholeVerdict,
 )
 from terrafix_tools.console.problems import Refusal
 from terrafix_tools.console.store.schema import events, flights, fragments, headings, hints, images, results
 
 EVENT_PAGE = 500  # events that are read at once [spec: about 200 kB]
 REFINED_KEYS = ("gps", "altitude", "ellipse", "orientation", "covariance", "m_per_unit")  # of a result
-_NUMBER = re.compile(r"(\d{1,12})\D*$")
+_DIGITS = re.compile(r"([0-9]+)")
 
 
 @dataclass(frozen=True)
@@ -58,17 +60,14 @@ class StoredEvent:
     data: str  # JSON
 
 
-def number_of(name: str) -> int:
-    """The number in the name of an image: the last digits before its suffix. Raises Refusal."""
-    found = _NUMBER.search(name.rpartition(".")[0] or name)
-    if found is None:
-        raise Refusal(422, f"{name!r}: the name of an image ends in its number, as in DJI_0042.jpg")
-    return int(found.group(1))
+def order_of(name: str) -> tuple[list[str | int], str]:
+    """Key of a name by which IMG_9 comes before IMG_10."""
+    return [int(part) if i % 2 else part for i, part in enumerate(_DIGITS.split(name))], name
 
 
 def create(db: sa.Connection, new: NewFlight) -> Flight:
     """A new flight; its map is made if it has an area."""
-    flight_id = secrets.token_hex(8)
+    flight_id = str(uuid.uuid4())
     row = {
         "id": flight_id,
         "name": new.name or flight_id,
@@ -165,14 +164,24 @@ def _flight(db: sa.Connection, row: "sa.Row") -> Flight:
         images=Images(
             uploaded=uploaded,
             processed=_count(db, results, row.id),
-            next_number=None if row.last_number is None else row.last_number + 1,
+            expected=spec.get("images"),
+            last_name=last_name(db, row.id),
         ),
         fragments=[Fragment(**{k: v for k, v in f._mapping.items() if k != "flight_id"}) for f in found],
         request=None if row.request is None else InputRequest.model_validate_json(row.request),
+        verdict=_verdict(db, row.id) if row.state == FlightState.COMPLETED.value else None,
         events_url=f"/flights/{row.id}/events",
         last_event_id=last_event_id(db, row.id),
         error=row.error,
     )
+
+
+def _verdict(db: sa.Connection, flight_id: str) -> WholeVerdict | None:
+    """On a completed flight; None: it was completed by an earlier version, or while no service saw it."""
+    query = sa.select(events.c.data).where(events.c.flight_id == flight_id, events.c.key == "completed 0")
+    data = db.execute(query).scalar_one_or_none()
+    given = None if data is None else json.loads(data).get("verdict")
+    return None if given is None else WholeVerdict.model_validate(given)
 
 
 def _count(db: sa.Connection, table: sa.Table, flight_id: str) -> int:
@@ -231,25 +240,23 @@ def repeated_batch(db: sa.Connection, flight_id: str, sums: list[tuple[str, str]
     return [stored[name][0] for name in names]
 
 
-def check_sequence(last_number: int | None, names: list[str]) -> int:
-    """-> the number of the last image. Raises Refusal: numbers do not follow each other."""
-    expected = last_number
-    for name in names:
-        number = number_of(name)
-        if expected is not None and number != expected + 1:
-            raise Refusal(
-                409, f"{name}: number {number}, expected {expected + 1}; images come in the sequence of names"
-            )
-        expected = number
-    assert expected is not None
-    return expected
+def last_name(db: sa.Connection, flight_id: str) -> str | None:
+    """Of the newest image."""
+    query = sa.select(images.c.name).where(images.c.flight_id == flight_id)
+    return db.execute(query.order_by(images.c.frame_id.desc()).limit(1)).scalar_one_or_none()
 
 
-def add_images(db: sa.Connection, flight_id: str, batch: Iterable[StoredImage], last_number: int) -> Accepted:
+def check_order(last: str | None, names: list[str]) -> None:
+    """Raises Refusal: names are not in their order, after that of the newest image. Gaps between numbers are normal."""
+    for before, name in pairwise([last, *names]):
+        if before is not None and name is not None and not order_of(before) < order_of(name):
+            raise Refusal(409, f"{name} does not come after {before}; images come in the order of their names")
+
+
+def add_images(db: sa.Connection, flight_id: str, batch: Iterable[StoredImage]) -> Accepted:
     rows = [{"flight_id": flight_id, **vars(image)} for image in batch]
     db.execute(images.insert(), rows)
-    update(db, flight_id, last_number=last_number)
-    return Accepted(frames=[row["frame_id"] for row in rows], repeated=False, next_number=last_number + 1)
+    return Accepted(frames=[row["frame_id"] for row in rows], repeated=False)
 
 
 def count_attempt(db: sa.Connection, flight_id: str, frame_id: int) -> None:
@@ -259,6 +266,25 @@ def count_attempt(db: sa.Connection, flight_id: str, frame_id: int) -> None:
         .where(images.c.flight_id == flight_id, images.c.frame_id == frame_id)
         .values(attempts=images.c.attempts + 1)
     )
+
+
+def retry(db: sa.Connection, flight_id: str) -> Flight:
+    """A flight that could not go on goes on: its map is fetched again, its images are read again."""
+    row = row_of(db, flight_id)
+    if not row.error:
+        raise Refusal(409, "nothing has failed; POST /flights/{id}/copy computes a flight again")
+    db.execute(images.update().where(images.c.flight_id == flight_id).values(attempts=0))
+    failed = row.map_state == MapState.FAILED.value
+    update(
+        db,
+        flight_id,
+        error="",
+        state=FlightState.PROCESSING.value,
+        map_state=MapState.PREPARING.value if failed else row.map_state,
+    )
+    changed = StateChanged(state=FlightState.PROCESSING, previous=FlightState(row.state))
+    add_events(db, flight_id, f"retry {last_event_id(db, flight_id)}", [changed])
+    return flight_of(db, flight_id)
 
 
 # --- results --------------------------------------------------------------------------------------
@@ -346,6 +372,19 @@ def hints_before(db: sa.Connection, flight_id: str, frame_id: int) -> list[tuple
                 .values(before_frame=frame_id)
             )
     return [(row.hint_id, _given(row.given)) for row in rows]
+
+
+def copy_hints(db: sa.Connection, flight_id: str, to: str) -> None:
+    """A copy gets the hints, each before the frame at which it was applied. One that came after the last image is
+    applied before the frame of its pixel, or that of the request."""
+    flight = row_of(db, flight_id)
+    asked = 0 if flight.request is None else InputRequest.model_validate_json(flight.request).frame_id
+    for row in db.execute(sa.select(hints).where(hints.c.flight_id == flight_id)).all():
+        given = _given(row.given)
+        at = row.before_frame
+        if at is None:
+            at = given.frame_id if isinstance(given, UserFix) else asked
+        db.execute(hints.insert().values(flight_id=to, hint_id=row.hint_id, given=row.given, before_frame=at))
 
 
 def _given(text: str) -> Hint | UserFix:

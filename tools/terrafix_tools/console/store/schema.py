@@ -2,7 +2,7 @@
 
 import sqlalchemy as sa
 
-VERSION = 2  # of these tables, in user_version of the file
+VERSION = 3  # of these tables, in user_version of the file
 SINCE_1 = "ALTER TABLE fragments ADD COLUMN state TEXT NOT NULL DEFAULT 'unanchored'"  # version 1 had none
 
 metadata = sa.MetaData()
@@ -27,7 +27,6 @@ flights = sa.Table(
     sa.Column("completing", sa.Boolean, nullable=False),
     sa.Column("error", sa.Text, nullable=False),
     sa.Column("request", sa.Text),  # JSON: InputRequest that is open
-    sa.Column("last_number", sa.Integer),  # in the name of the newest image
 )
 images = sa.Table(
     "images",

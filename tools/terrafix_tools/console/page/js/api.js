@@ -1,5 +1,7 @@
 // Requests to the service (docs/console.md). A refusal is a Problem with the service's own words.
 
+const HEAD_BYTES = 256 * 1024; // of a photo: EXIF and XMP are before them
+
 export class Problem extends Error {
   constructor(status, detail) {
     super(detail);
@@ -33,6 +35,16 @@ async function request(method, path, body) {
   return response.status === 204 ? null : response.json();
 }
 
+/** What photos state; ``photos``: as of photos.js, ``description``: text of a flight.toml or null. */
+export async function photoFacts(photos, description) {
+  const form = new FormData();
+  for (const {name, get: bytes} of photos) form.append("images", (await bytes()).slice(0, HEAD_BYTES), name);
+  if (description !== null) form.append("description", new Blob([description]), "flight.toml");
+  const response = await fetch("/photos", {method: "POST", credentials: "same-origin", body: form});
+  if (!response.ok) throw await problemOf(response);
+  return response.json();
+}
+
 export const get = (path) => request("GET", path);
 export const post = (path, body) => request("POST", path, body);
 export const remove = (path) => request("DELETE", path);
@@ -50,7 +62,7 @@ export async function allResults(flightId, refined) {
 }
 
 /** One batch of images. onBytes(sent) tells the progress, which fetch does not. */
-export function uploadBatch(flightId, form, onBytes) {
+export function uploadBatch(flightId, form, onBytes, signal) {
   return new Promise((resolve, reject) => {
     const sending = new XMLHttpRequest();
     sending.open("POST", `/flights/${flightId}/images/batch`);
@@ -63,6 +75,9 @@ export function uploadBatch(flightId, form, onBytes) {
       if (sending.status === 202) resolve(body);
       else reject(new Problem(sending.status, body.detail || sending.statusText));
     };
+    sending.onabort = () => reject(new Problem(0, "cancelled"));
+    signal.addEventListener("abort", () => sending.abort());
+    if (signal.aborted) return void reject(new Problem(0, "cancelled"));
     sending.send(form);
   });
 }

@@ -8,12 +8,14 @@ import {FrameView} from "./frame_view.js";
 import {square} from "./geo.js";
 import {L, baseMap} from "./map_view.js";
 import {t} from "./texts.js";
+import {words} from "./words.js";
 
 const HINT_M = 500; // default radius of a hint
 
 export class AskView {
-  constructor(flight, request, info) {
-    Object.assign(this, {flight, request, info, pixel: null, place: null, small: []});
+  /** ``heading``: of the top of the image, null: not known. */
+  constructor(flight, request, info, heading) {
+    Object.assign(this, {flight, request, info, heading, pixel: null, place: null, small: []});
     this.frame = new FrameView((at) => { this.pixel = at; this.update(); });
     this.mapBox = h("div", {class: "ask-map", "aria-label": t("map")});
     this.line = h("p", {class: "ask-line", role: "status"});
@@ -22,7 +24,7 @@ export class AskView {
     this.hint = h("button", {onclick: () => this.coarse()}, t("send_hint"));
     this.tiles = h("ol", {class: "places", "aria-label": t("best_places")});
     this.dialog = h("dialog", {class: "ask", "aria-labelledby": "ask-title"},
-      h("header", {}, h("h1", {id: "ask-title"}, t("ask_title", number(request.frame_id))), h("button", {onclick: () => this.close(), "aria-label": t("close")}, "×")),
+      h("header", {}, h("h1", {id: "ask-title"}, t("ask_title", request.file || number(request.frame_id))), h("button", {onclick: () => this.close(), "aria-label": t("close")}, "×")),
       h("p", {class: "soft"}, t("ask_how")),
       h("div", {class: "ask-panes"}, h("section", {}, h("h2", {}, t("ask_step1")), this.frame.element), h("section", {}, h("h2", {}, t("ask_step2")), this.mapBox)),
       this.tiles,
@@ -42,7 +44,8 @@ export class AskView {
     document.body.append(this.dialog);
     this.dialog.showModal();
     const {frame_id: frame, image_url: url, candidate_tiles: places} = this.request;
-    this.frame.show(url ?? `/flights/${this.flight.flight_id}/frames/${frame}/image`, t("frame_alt", number(frame)));
+    this.frame.show(url ?? `/flights/${this.flight.flight_id}/frames/${frame}/image`, t("frame_alt", number(frame)), this.heading);
+    this.frame.turn(true);
     this.map = baseMap(this.mapBox, this.info);
     L.control.zoom({zoomInTitle: t("zoom_in"), zoomOutTitle: t("zoom_out")}).addTo(this.map);
     L.control.scale({imperial: false}).addTo(this.map);
@@ -50,7 +53,7 @@ export class AskView {
     this.mapBox.append(h("div", {class: "map-cross", "aria-hidden": "true"}));
     this.showPlaces(places);
     this.update();
-    this.frame.element.focus();
+    this.frame.focus();
   }
 
   /** The best places, which may come after the request itself. */
@@ -113,7 +116,7 @@ export class AskView {
       const {detail} = await post(`/flights/${this.flight.flight_id}/${path}`, body);
       this.onSent?.(path, body);
       this.close();
-      toast(t("fix_sent", detail));
+      toast(t("fix_sent", words(detail)));
     } catch (error) {
       this.update();
       this.line.textContent = error.message;

@@ -11,17 +11,18 @@ import {stateBadge} from "./list_view.js";
 import {MapView} from "./map_view.js";
 import {FlightModel} from "./model.js";
 import {uploads, startUpload} from "./new_view.js";
-import {AutopilotPanel, LogPanel, ObjectPanel, OverviewPanel, SystemPanel, VerdictPanel} from "./panels.js";
+import {LogPanel, ObjectPanel, OverviewPanel, VehiclePanel, VerdictPanel} from "./panels.js";
 import {mayAct} from "./session.js";
 import {SOURCES, sign} from "./sources.js";
 import {EventStream} from "./stream.js";
 import {t} from "./texts.js";
-import {BATCH, inOrder, isSequence, readTable} from "./upload.js";
+import {words} from "./words.js";
+import {compareNames, sorted} from "./photos.js";
+import {BATCH, readTable} from "./upload.js";
 
 const EARLIER_EVENTS = 1000; // that are read again when a flight is opened: the logs keep as many
 const REFRESH_MS = 1000; // between two readings of the flight itself, and of live images
 const TICK_MS = 500; // ages are shown anew
-const HEALTH_MS = 5000;
 
 export class FlightView {
   constructor(main, middle, flightId) {
@@ -30,7 +31,8 @@ export class FlightView {
 
   async open() {
     const flight = await get(`/flights/${this.flightId}`);
-    const [results, maps] = await Promise.all([allResults(this.flightId, true), get("/maps")]);
+    const [results, maps, config] = await Promise.all([allResults(this.flightId, true), get("/maps"), get(`/flights/${this.flightId}/config`)]);
+    this.mountYaw = config.flight.mount?.yaw_deg;
     if (this.closed) return;
     this.info = maps.maps.find((one) => one.name === flight.map.name) ?? null;
     this.model = new FlightModel(flight, results);
@@ -38,8 +40,7 @@ export class FlightView {
     this.build();
     const after = flight.request ? 0 : Math.max(0, flight.last_event_id - EARLIER_EVENTS);
     this.stream = new EventStream(this.flightId, after, (event) => this.event(event), (state, status) => this.connection(state, status));
-    this.timers = [setInterval(() => this.tick(), TICK_MS), setInterval(() => this.health(), HEALTH_MS)];
-    this.health();
+    this.timers = [setInterval(() => this.tick(), TICK_MS)];
     this.draw();
   }
 
@@ -55,12 +56,13 @@ export class FlightView {
   // --- parts ---------------------------------------------------------------------------------------
 
   build() {
-    this.glance = new Glance();
+    this.glance = new Glance(() => this.draw());
     this.lost = h("p", {class: "banner lost", role: "alert", hidden: true});
     this.asking = h("div", {class: "banner ask-banner", role: "alert", hidden: true});
     this.problem = h("p", {class: "banner failed", role: "alert", hidden: true});
+    this.through = h("div", {class: "banner through", role: "status", hidden: true});
     this.mapBox = h("div", {class: "map", "aria-label": t("map_help")});
-    const main = h("div", {class: "flight"}, this.lost, this.problem, this.asking, this.glance.element,
+    const main = h("div", {class: "flight"}, this.lost, this.problem, this.asking, this.through, this.glance.element,
       h("div", {class: "stage"}, this.mapBox, this.tools(), this.legend(), this.info ? null : h("p", {class: "no-map"}, t("no_such_map", this.model.flight.map.name))),
       h("aside", {class: "side", "aria-label": t("details")}, this.frameCard(), this.uploadSlot = h("div", {}), this.tabs()));
     fill(this.main, main);
@@ -91,7 +93,8 @@ export class FlightView {
     this.mapBox.addEventListener("keydown", this.escape);
     return h("div", {class: "tools", role: "toolbar", "aria-label": t("tools")}, this.followButton,
       h("button", {onclick: () => this.mapView.fit()}, t("fit")),
-      toggle(t("all_ellipses"), true, (on) => { this.mapView.track.all = on; this.mapView.track.redraw(); }), this.measureButton, this.measured);
+      toggle(t("all_ellipses"), true, (on) => { this.mapView.track.all = on; this.mapView.track.redraw(); }), this.measureButton,
+      this.glance.format, this.glance.copy, this.measured);
   }
 
   legend() {
@@ -118,13 +121,13 @@ export class FlightView {
 
   enlarge() {
     this.card.classList.toggle("large");
-    this.frame.element.focus();
+    this.frame.focus();
   }
 
   tabs() {
     this.objects = new ObjectPanel();
-    this.panels = {overview: new OverviewPanel(this.actions()), verdicts: new VerdictPanel(), autopilot: new AutopilotPanel(),
-      system: new SystemPanel(), log: new LogPanel(), objects: this.objects, export: {element: this.exports(), update() {}}};
+    this.panels = {overview: new OverviewPanel(this.actions()), ...(this.model.isLive ? {vehicle: new VehiclePanel()} : {}),
+      verdicts: new VerdictPanel(), log: new LogPanel(), objects: this.objects, export: {element: this.exports(), update() {}}};
     const names = Object.keys(this.panels);
     const list = h("div", {class: "tabs", role: "tablist"});
     const show = (name, focus = false) => {
@@ -158,11 +161,12 @@ export class FlightView {
 
   actions() {
     if (!mayAct()) return h("p", {class: "soft"}, t("viewer"));
-    this.more = h("input", {type: "file", multiple: true, accept: "image/jpeg,image/png,.csv", class: "unseen", id: "more", onchange: () => this.addPhotos()});
+    this.more = h("input", {type: "file", multiple: true, accept: "image/jpeg,image/png,.zip,.csv", class: "unseen", id: "more", onchange: () => this.addPhotos(this.more.files)});
     this.moreLabel = h("label", {class: "button", for: "more"}, t("add_photos"));
     this.completeButton = h("button", {onclick: () => this.complete()}, t("complete"));
     this.askButton = h("button", {onclick: () => this.help()}, t("give_position"));
-    return h("div", {class: "actions"}, this.more, this.moreLabel, this.completeButton, this.askButton);
+    const copy = this.model.isLive ? null : h("a", {class: "button", href: `#/new/${this.flightId}`}, t("duplicate"));
+    return h("div", {class: "actions"}, this.more, this.moreLabel, this.completeButton, this.askButton, copy);
   }
 
   exports() {
@@ -228,13 +232,6 @@ export class FlightView {
     this.showLost();
   }
 
-  async health() {
-    try {
-      this.serviceHealth = await get("/health");
-      if (this.tab === "system") this.dirty = true;
-    } catch { /* the stream tells */ }
-  }
-
   showLost() {
     const {model} = this;
     this.lost.hidden = model.connection !== "lost";
@@ -252,11 +249,12 @@ export class FlightView {
     this.glance.update(model);
     this.showLost();
     this.problem.hidden = !flight.error;
-    this.problem.textContent = flight.error;
+    this.problem.textContent = words(flight.error);
     this.drawRequest();
+    this.drawThrough();
     this.mapView.show(model, this.selected, flight.state !== "completed");
     this.drawFrame();
-    this.panels[this.tab].update(model, this.serviceHealth);
+    this.panels[this.tab].update(model);
     if (this.more) {
       const open = !model.isLive && flight.state !== "completed";
       this.moreLabel.hidden = this.more.disabled = this.completeButton.hidden = !open;
@@ -274,9 +272,29 @@ export class FlightView {
     this.requestKey = key;
     this.asking.hidden = !request;
     if (!request) return void this.mapView.showCandidates([]);
-    fill(this.asking, h("span", {}, t("ask_banner", number(request.frame_id))), mayAct() ? h("button", {class: "primary", onclick: () => this.help()}, t("help")) : null);
+    fill(this.asking, h("span", {}, t("ask_banner", this.model.results.get(request.frame_id)?.file || number(request.frame_id))), mayAct() ? h("button", {class: "primary", onclick: () => this.help()}, t("help")) : null);
     this.mapView.showCandidates(request.candidate_tiles);
     if (this.ask?.request.request_id === request.request_id) this.ask.showPlaces(request.candidate_tiles);
+  }
+
+  /** What the flight waits for: the rest of its photos, or the word that they are all; a failure to be tried again. */
+  drawThrough() {
+    const {flight, isLive, request} = this.model;
+    const {uploaded, processed, expected} = flight.images;
+    const open = mayAct() && !isLive && flight.state !== "completed" && !flight.completing && !uploads.has(this.flightId);
+    const through = open && uploaded > 0 && processed >= uploaded && !flight.error;
+    const what = !open ? "" : flight.error ? "failed" : uploaded < (expected ?? 0) ? "resume" : through && request && this.helped ? "helped" : through && !request && !expected ? "through" : "";
+    if (this.waits === `${what}${uploaded}`) return;
+    this.waits = `${what}${uploaded}`;
+    this.through.hidden = !what;
+    const button = (text, onclick) => h("button", {class: "primary", onclick}, t(text));
+    const complete = uploaded ? button("complete_now", () => this.complete(true)) : null;
+    fill(this.through, {
+      failed: () => [h("span", {}, t("failed_why")), button("retry", () => this.again("retry"))],
+      resume: () => [h("span", {}, t("resume", number(uploaded), number(expected))), h("label", {class: "button", for: "more"}, t("resume_choose")), complete],
+      helped: () => [h("span", {}, t("helped")), button("compute_again", () => this.again("copy"))],
+      through: () => [h("span", {}, t("through", number(uploaded))), complete],
+    }[what]?.() ?? []);
   }
 
   drawFrame() {
@@ -294,13 +312,18 @@ export class FlightView {
     }
     this.imageAt = now;
     this.shown = result;
-    this.frameTitle.textContent = t("frame_number", number(result.frame_id));
+    this.frameTitle.textContent = result.file || t("frame_number", number(result.frame_id));
     this.newestButton.setAttribute("aria-pressed", String(this.selected === null));
-    this.frame.show(`/flights/${this.flightId}/frames/${result.frame_id}/image`, t("frame_alt", number(result.frame_id)));
+    this.frame.show(`/flights/${this.flightId}/frames/${result.frame_id}/image`, t("frame_alt", number(result.frame_id)), this.topOf(result));
     const verdict = model.verdicts.findLast((one) => one.frame_id === result.frame_id && one.measurement === "map");
     fill(this.frameFacts, sign(result.source), h("span", {}, t(`source_${result.source || "none"}`)),
-      h("span", {}, result.match ? t("match_line", result.match.replaceAll("_", " "), result.inliers ? t("inliers", number(result.inliers)) : "") : t("no_match")),
-      verdict && verdict.detail ? h("span", {class: "soft"}, verdict.detail) : null, h("span", {class: "soft"}, result.file), result.error ? h("span", {class: "error"}, result.error) : null);
+      h("span", {}, result.match ? t("match_line", t(`verdict_${result.match}`), result.inliers ? t("inliers", number(result.inliers)) : "") : t("no_match")),
+      verdict && verdict.detail ? h("span", {class: "soft"}, words(verdict.detail)) : null, result.file ? h("span", {class: "soft"}, t("frame_number", number(result.frame_id))) : null, result.error ? h("span", {class: "error"}, words(result.error)) : null);
+  }
+
+  /** Heading of the top of an image, of a camera that looks down: that of the vehicle and of the mount. */
+  topOf(result) {
+    return (result?.heading ?? null) === null ? null : (result.heading + (this.mountYaw ?? 0)) % 360;
   }
 
   select(id) {
@@ -334,7 +357,7 @@ export class FlightView {
       this.mapView.centre(found.gps);
       this.showTab("objects");
       this.card.classList.remove("large");
-      toast(`${name}: ${coordinate(found.gps)} ± ${metres(found.accuracy_meters)} (95 %)`);
+      toast(`${name}: ${coordinate(found.gps, found.accuracy_meters)} ± ${metres(found.accuracy_meters)} (95 %)`);
     } catch (error) {
       toast(error.message, true);
     }
@@ -343,14 +366,18 @@ export class FlightView {
   help() {
     if (this.ask) return;
     const request = this.model.request ?? {frame_id: this.shown.frame_id, candidate_tiles: []};
-    this.ask = new AskView(this.model.flight, request, this.info);
+    this.ask = new AskView(this.model.flight, request, this.info, this.topOf(this.model.results.get(request.frame_id)));
     this.ask.onClosed = () => { this.ask = null; };
-    this.ask.onSent = (path, body) => this.mapView.addMark(body, body.radius_m ?? 5);
+    this.ask.onSent = (path, body) => {
+      this.mapView.addMark(body, body.radius_m ?? 5);
+      this.helped = true;
+      this.dirty = true;
+    };
     this.ask.open();
   }
 
-  async complete() {
-    if (!confirm(t("complete_sure"))) return;
+  async complete(sure = false) {
+    if (!sure && !confirm(t("complete_sure"))) return;
     try {
       this.model.refresh(await post(`/flights/${this.flightId}/complete`));
       this.draw();
@@ -359,20 +386,32 @@ export class FlightView {
     }
   }
 
-  async addPhotos() {
-    const all = [...this.more.files];
-    this.more.value = "";
-    const files = inOrder(all.filter((file) => !file.name.endsWith(".csv")));
-    const tables = all.filter((file) => file.name.endsWith(".csv"));
+  /** Further photos, or the same ones again after an upload that was broken off: those that are there are left out. */
+  async addPhotos(files) {
     try {
-      if (files.length < BATCH[0]) throw new Error(t("too_few", BATCH[0]));
-      const table = tables.length ? readTable(await tables[0].text(), files) : null;
-      const next = (await get(`/flights/${this.flightId}`)).images.next_number;
-      const fits = isSequence(files.map((file) => file.name), next);
-      if (!fits && !confirm(t("renumber_sure", number(next ?? 1)))) return;
-      const running = startUpload(this.flightId, files, table, fits ? null : next ?? 1);
+      const found = await sorted(files);
+      this.more.value = "";
+      const {last_name: last} = (await get(`/flights/${this.flightId}`)).images;
+      const photos = found.photos.filter((photo) => last === null || compareNames(photo.name, last) > 0);
+      if (!photos.length) throw new Error(t("all_there", last));
+      if (photos.length < BATCH[0]) throw new Error(t("too_few", BATCH[0]));
+      const table = found.table === null ? null : readTable(found.table, photos);
+      const running = startUpload(this.flightId, photos, table);
       this.draw();
       if (!await running) toast(t("upload_failed"), true);
+    } catch (error) {
+      toast(error.message, true);
+    }
+  }
+
+  /** The same flight again, with the positions that were given meanwhile; or what has failed is tried again. */
+  async again(path) {
+    try {
+      const {flight} = path === "copy" ? await get(`/flights/${this.flightId}/config`) : {};
+      const made = await post(`/flights/${this.flightId}/${path}`, flight);
+      if (path === "retry") this.model.refresh(made);
+      else location.hash = `#/flight/${made.flight_id}`;
+      this.draw();
     } catch (error) {
       toast(error.message, true);
     }

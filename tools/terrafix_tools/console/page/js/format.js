@@ -1,5 +1,6 @@
 // Numbers as text, always with their unit. "–" is "not known".
 
+import {FORMATS, written} from "./coordinates.js";
 import {locale} from "./texts.js";
 
 export const NONE = "–";
@@ -19,8 +20,12 @@ export function metres(value) {
   return unit(value, Math.abs(value) < 100 ? 1 : 0, "m");
 }
 
-/** Latitude, longitude: six decimals are 0.1 m. Decimal points in every language: it is copied into other programs. */
-export const coordinate = (gps) => (gps ? `${gps.lat.toFixed(6)}, ${gps.lon.toFixed(6)}` : NONE);
+let format = FORMATS[0];
+export const coordinateFormat = () => format;
+export const setCoordinateFormat = (name) => { format = FORMATS.includes(name) ? name : FORMATS[0]; };
+
+/** ``accuracy``: its radius [m], which decides on the digits. */
+export const coordinate = (gps, accuracy) => (gps ? written(gps, format, accuracy) : NONE);
 
 export const degrees = (value) => (known(value) ? `${number((value % 360 + 360) % 360)}°` : NONE);
 

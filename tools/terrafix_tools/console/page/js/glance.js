@@ -1,13 +1,18 @@
-// The first line of the display: where it is, how sure that is, how old, and what the autopilot has of it.
+// The first lines of the display: what the autopilot has (live) or the verdict (completed), then where it is, how sure
+// that is, and how old.
 
-import {fill, h, svg} from "./dom.js";
-import {NONE, clock, coordinate, degrees, metres, number, seconds, unit} from "./format.js";
-import {sign} from "./sources.js";
+import {FORMATS} from "./coordinates.js";
+import {fill, h, svg, toast} from "./dom.js";
+import {NONE, clock, coordinate, coordinateFormat, degrees, metres, number, seconds, setCoordinateFormat, unit} from "./format.js";
+import {placement, sign} from "./sources.js";
 import {t} from "./texts.js";
+import {words} from "./words.js";
 
 const FACTS_OLD_MS = 4000; // facts come once a second
 const OLD_FIX_S = 5; // of flight, after which the position of an earlier frame is no longer that of the vehicle
 const WORRYING_S = 30; // without a map fix: what odometry alone drifts meanwhile is worth a look
+const CHI2_95 = 5.991; // two degrees of freedom
+const NEAR_M = 20; // of docs/console.md, `confidence`
 
 function cell(label, value, below, mood = "", extra = null) {
   return h("div", {class: `cell ${mood}`}, h("span", {class: "label"}, label), h("span", {class: "value"}, value, extra), h("span", {class: "below"}, below));
@@ -26,9 +31,31 @@ function ellipseSign(ellipse) {
       fill: "currentColor", "fill-opacity": 0.18, stroke: "currentColor", "stroke-width": 2}));
 }
 
+/** Probability that the position is within NEAR_M, by the ellipse that is shown. */
+const within20 = (ellipse) => -Math.expm1(-(NEAR_M ** 2) * CHI2_95 / (2 * ellipse.semi_major_m ** 2));
+
 export class Glance {
-  constructor() {
-    this.element = h("section", {class: "glance", "aria-label": t("glance")});
+  /** onFormat(): another way to write positions was chosen. ``format`` and ``copy`` are for the toolbar. */
+  constructor(onFormat) {
+    this.format = h("select", {class: "format", "aria-label": t("position_format"), title: t("position_format"), onchange: () => {
+      setCoordinateFormat(this.format.value);
+      onFormat();
+    }}, FORMATS.map((one) => h("option", {value: one, selected: one === coordinateFormat()}, t(`format_${one}`))));
+    this.copy = h("button", {title: t("copy"), onclick: () => this.copied()}, t("copy_short"));
+    this.more = h("button", {class: "more", "aria-expanded": "false", "aria-label": t("more"), title: t("more"), onclick: () => {
+      this.more.setAttribute("aria-expanded", String(this.element.classList.toggle("open")));
+    }}, "⋯");
+    this.cells = h("div", {class: "cells"});
+    this.element = h("section", {class: "glance", "aria-label": t("glance")}, this.cells, this.more);
+  }
+
+  async copied() {
+    try {
+      await navigator.clipboard.writeText(this.text);
+      toast(t("copied", this.text));
+    } catch {
+      toast(this.text); // pages over plain http from another computer may not write to the clipboard
+    }
   }
 
   update(model) {
@@ -36,27 +63,66 @@ export class Glance {
     const fresh = freshFacts(model);
     const stale = model.connection === "lost" || (model.isLive && model.flight.state !== "completed" && model.facts && !fresh);
     this.element.classList.toggle("stale", Boolean(stale));
-    if (!frame) {
-      fill(this.element, cell(t("position"), NONE, t("no_frames_yet")));
-      return;
-    }
     const fix = model.newestFix;
-    const age = fix ? frame.t_s - fix.t_s : 0; // a frame may have no position: it was left out, or is not placed yet
-    const ellipse = fix?.ellipse;
-    const digits = ellipse && ellipse.semi_major_m >= 100 ? 0 : 1;
-    const cells = [
-      fix ? cell(t("position"), coordinate(fix.gps), [sign(fix.source), t(`source_${fix.source || "none"}`), age > 0 ? ` · ${t("ago", seconds(age))}` : ""],
-        age > OLD_FIX_S ? "wide bad" : "wide") : cell(t("position"), t("no_position"), frame.error || t(`state_${model.flight.state}`), "wide bad"),
-      cell(t("ellipse95"), ellipse ? `${number(ellipse.semi_major_m, digits)} × ${number(ellipse.semi_minor_m, digits)} m` : NONE,
-        ellipse ? t("within20", unit(fix.confidence === null ? null : 100 * fix.confidence, 0, "%")) : t("not_known"),
-        `ell ${ellipse && ellipse.semi_major_m > 100 ? "warn" : ""}`, ellipse ? ellipseSign(ellipse) : null),
-      this.lastMatch(model, fresh),
-      cell(t("height"), unit(fix?.agl_m, 0, "m"), t("amsl", unit(fix?.altitude, 0, "m"))),
-      cell(t("heading"), degrees(fix?.heading), fresh ? t("speed", unit(fresh.position.speed_mps, 1, "m/s")) : t("true_north")),
-    ];
-    if (model.isLive && model.flight.state !== "completed") cells.push(this.autopilot(fresh));
-    cells.push(cell(t("frame"), number(frame.frame_id), stale ? t("as_of", clock(model.updatedAt ?? model.openedAt)) : this.age(model), stale ? "bad" : ""));
-    fill(this.element, cells, stale ? h("strong", {class: "stale-sign"}, t("stale")) : null);
+    this.text = fix ? coordinate(fix.gps, fix.ellipse?.semi_major_m) : "";
+    this.copy.disabled = this.format.disabled = !fix;
+    const cells = [this.headline(model, fresh), this.position(model)];
+    if (frame) {
+      const ellipse = fix?.ellipse;
+      const digits = ellipse && ellipse.semi_major_m >= 100 ? 0 : 1;
+      cells.push(
+        cell(t("ellipse95"), ellipse ? `${number(ellipse.semi_major_m, digits)} × ${number(ellipse.semi_minor_m, digits)} m` : NONE,
+          ellipse ? t("within20", unit(100 * within20(ellipse), 0, "%")) : t("not_known"),
+          ellipse && ellipse.semi_major_m > 100 ? "warn" : "", ellipse ? ellipseSign(ellipse) : null),
+        this.lastMatch(model, fresh),
+        cell(t("height_heading"), `${unit(fix?.agl_m, 0, "m")} · ${degrees(fix?.heading)}`,
+          fresh ? t("speed", unit(fresh.position.speed_mps, 1, "m/s")) : t("amsl", unit(fix?.altitude, 0, "m"))),
+        cell(t("frame"), h("span", {class: "name", title: frame.file}, frame.file || number(frame.frame_id)), stale ? t("as_of", clock(model.updatedAt ?? model.openedAt)) : this.age(model), stale ? "bad" : ""));
+    }
+    fill(this.cells, cells, stale ? h("strong", {class: "stale-sign"}, t("stale")) : null);
+  }
+
+  /** What the autopilot has; of a flight that is over the verdict. */
+  headline(model, fresh) {
+    const {flight} = model;
+    if (flight.state === "completed") return flight.verdict ? this.verdict(flight.verdict) : cell(t("whole_verdict"), NONE, t("no_verdict"), "first");
+    if (model.isLive) return this.autopilot(fresh);
+    if (flight.error) return cell(t("flight"), t("state_failed"), words(flight.error), "first bad");
+    if (flight.completing) return cell(t("flight"), t("being_solved"), model.progress ? t(`stage_${model.progress.stage}`) : "", "first");
+    const {processed, uploaded} = flight.images;
+    return cell(t("flight"), t("images_done", number(processed), number(uploaded)), t(`state_${flight.state}`), "first");
+  }
+
+  verdict({verdict, trusted_files: files, trusted_s: spans, reasons, cause}) {
+    const mood = {"trust it": "good", "trust it in part": "warn"}[verdict] ?? "bad";
+    const named = files.map(([a, b], i) => (a ? `${a} – ${b}` : `${seconds(spans[i][0])} – ${seconds(spans[i][1])}`));
+    const only = mood === "warn" ? [t("only_from", named.slice(0, 2).join(", ") + (named.length > 2 ? " …" : ""))] : [];
+    const why = [...only, ...reasons.map(words), cause ? t("likely", words(cause)) : ""].filter(Boolean).join(" · ");
+    return cell(t("whole_verdict"), t(`whole_${verdict.replaceAll(" ", "_")}`), h("span", {title: why}, why || t("no_doubts")), `first ${mood}`);
+  }
+
+  autopilot(fresh) {
+    if (!fresh) return cell(t("sent_fix"), NONE, t("no_facts"), "first bad");
+    const {fix, accuracy_m: accuracy, reason} = fresh.position;
+    return fix === "3D" ? cell(t("sent_fix"), `${t("fix_3d")} ± ${metres(accuracy)}`, t("one_sigma"), "first good")
+      : cell(t("sent_fix"), t("fix_none"), words(reason), "first bad");
+  }
+
+  position(model) {
+    const {newest: frame, newestFix: fix} = model;
+    if (!frame) return cell(t("position"), NONE, t("no_frames_yet"), "wide");
+    const known = placement(frame);
+    if (known === "unknown" && model.flight.state !== "completed") {
+      const search = t(frame.search === "normal" ? (frame.error ? "source_none" : "searching") : `search_${frame.search}`);
+      const before = fix && fix !== frame ? t("last_known", coordinate(fix.gps, fix.ellipse?.semi_major_m), seconds(frame.t_s - fix.t_s)) : "";
+      return cell(t("position"), t("position_unknown"), [search, before].filter(Boolean).join(" · "), "wide bad");
+    }
+    if (!fix) return cell(t("position"), t("position_unknown"), words(frame.error) || t("source_not_placed"), "wide bad");
+    const age = frame.t_s - fix.t_s; // a frame may have no position: it was left out
+    const state = placement(fix);
+    const how = fix.refined_by === "finalised" ? "by_whole_flight" : state === "propagated" ? `source_${fix.source}` : "source_satellite_anchored";
+    return cell(t("position"), this.text, [sign(fix.source), `${t(`is_${state}`)}: ${t(how)}`, age > 0 ? ` · ${t("ago", seconds(age))}` : ""],
+      age > OLD_FIX_S || state === "unknown" ? "wide bad" : "wide");
   }
 
   age(model) {
@@ -68,14 +134,7 @@ export class Glance {
   lastMatch(model, fresh) {
     const since = fresh ? fresh.position.since_map_fix_s : model.sinceMatch_s;
     if (since === null || since === undefined) return cell(t("last_match"), NONE, t("no_match_yet"), "warn");
-    const search = model.newest.search;
-    const below = search && search !== "normal" ? t(`search_${search}`) : model.lastMatch ? t("of_frame", number(model.lastMatch.frame_id)) : "";
-    return cell(t("last_match"), since < 0.05 ? t("now") : t("ago", seconds(since)), below, since > WORRYING_S ? "warn" : "");
-  }
-
-  autopilot(fresh) {
-    if (!fresh) return cell(t("sent_fix"), NONE, t("no_facts"), "bad");
-    const {fix, accuracy_m: accuracy, reason} = fresh.position;
-    return fix === "3D" ? cell(t("sent_fix"), t("fix_3d"), `± ${metres(accuracy)}`, "good") : cell(t("sent_fix"), t("fix_none"), reason, "bad");
+    const below = model.lastMatch ? model.lastMatch.file || t("of_frame", number(model.lastMatch.frame_id)) : "";
+    return cell(t("last_match"), since < 0.05 ? t("now") : t("ago", seconds(since)), h("span", {class: "name"}, below), since > WORRYING_S ? "warn" : "");
   }
 }

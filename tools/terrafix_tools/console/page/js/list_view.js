@@ -53,9 +53,11 @@ export class ListView {
     const row = (flight) => h("li", {class: "card flight-row"},
       h("a", {href: `#/flight/${flight.flight_id}`, class: "stretched"}, flight.name || flight.flight_id),
       h("span", {}, stateBadge(flight), flight.kind === "live" ? h("span", {class: "badge live"}, t("kind_live")) : null,
-        flight.request ? h("span", {class: "badge blocked"}, t("asks")) : null),
+        flight.request ? h("span", {class: "badge blocked"}, t("asks")) : null,
+        flight.verdict ? h("span", {class: "badge completed"}, t(`whole_${flight.verdict.verdict.replaceAll(" ", "_")}`)) : null),
       h("span", {class: "soft"}, flight.kind === "live" ? "" : t("images_done", number(flight.images.processed), number(flight.images.uploaded))),
       h("span", {class: "soft"}, dateTime(flight.created_at)),
+      mayAct() && flight.kind !== "live" && flight.images.uploaded ? h("a", {class: "button above", href: `#/new/${flight.flight_id}`}, t("duplicate")) : null,
       mayAct() ? h("button", {class: "above", onclick: () => this.remove(flight), "aria-label": t("delete_named", flight.name || flight.flight_id)},
         t("delete")) : null);
     return h("ul", {class: "flights"}, flights.map(row));

@@ -5,6 +5,7 @@ import {fill, h} from "./dom.js";
 import {FlightView} from "./flight_view.js";
 import {ListView} from "./list_view.js";
 import {NewView} from "./new_view.js";
+import {coordinateFormat, setCoordinateFormat} from "./format.js";
 import {mayAct, session, setSession} from "./session.js";
 import {LANGUAGES, language, setLanguage, t} from "./texts.js";
 
@@ -33,6 +34,9 @@ function bar() {
   return h("header", {class: "bar"},
     h("a", {class: "brand", href: "#/"}, h("img", {src: "icon.svg", alt: "", width: 26, height: 26}), h("span", {}, "Terrafix")),
     h("div", {class: "bar-middle", id: "bar-middle"}),
+    h("button", {class: "menu", "aria-label": t("menu"), "aria-expanded": "false", onclick: (event) => {
+      event.target.setAttribute("aria-expanded", String(document.querySelector(".bar nav").classList.toggle("open")));
+    }}, "☰"),
     h("nav", {"aria-label": t("menu")},
       session.role ? h("a", {class: "button", href: "#/"}, t("flights")) : null,
       mayAct() ? h("a", {class: "button", href: "#/new"}, t("new_flight")) : null,
@@ -76,7 +80,7 @@ async function route() {
   const main = h("main", {id: "main"});
   fill(app, bar(), main);
   const middle = document.getElementById("bar-middle");
-  const opened = kind === "flight" && id ? new FlightView(main, middle, id) : kind === "new" && mayAct() ? new NewView(main) : new ListView(main);
+  const opened = kind === "flight" && id ? new FlightView(main, middle, id) : kind === "new" && mayAct() ? new NewView(main, id) : new ListView(main);
   view = opened;
   document.title = "Terrafix";
   try {
@@ -105,5 +109,7 @@ async function start() {
 
 setLanguage(stored("language") ?? navigator.language.slice(0, 2));
 setTheme(stored("theme") ?? "system");
+setCoordinateFormat(stored("format"));
+addEventListener("pagehide", () => store("format", coordinateFormat()));
 addEventListener("hashchange", route);
 start();

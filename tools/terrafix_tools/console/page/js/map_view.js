@@ -3,7 +3,7 @@
 import {bearing, distance, square} from "./geo.js";
 import {coordinate, degrees, metres} from "./format.js";
 import {h} from "./dom.js";
-import {styleOf, trace} from "./sources.js";
+import {placement, styleOf, trace} from "./sources.js";
 import {t} from "./texts.js";
 
 const L = window.L;
@@ -43,8 +43,10 @@ const Track = L.Path.extend({
     this.results = [];
     this.selected = null;
     this.all = true; // ellipses of all frames, or of the newest alone
+    this.lost = false; // the vehicle is somewhere in the newest ellipse, if at all
   },
-  show(results, selected) {
+  show(results, selected, lost) {
+    this.lost = lost;
     this.results = results.filter((r) => r.gps);
     this.selected = selected;
     if (this._map) { this._project(); this.redraw(); }
@@ -153,6 +155,17 @@ const Track = L.Path.extend({
     const newest = this.results[this.results.length - 1];
     const {x, y} = this._points[this._points.length - 1];
     c.translate(x, y);
+    if (this.lost) {
+      c.font = "bold 34px sans-serif";
+      c.textAlign = "center";
+      c.textBaseline = "middle";
+      c.lineWidth = 6;
+      c.strokeStyle = "#0a0e12";
+      c.strokeText("?", 0, 0);
+      c.fillStyle = "#ffb7c4";
+      c.fillText("?", 0, 0);
+      return;
+    }
     if (newest.heading === null) {
       trace(c, "circle", 0, 0, 8);
     } else {
@@ -185,6 +198,8 @@ export class MapView {
     this.drawn = L.layerGroup().addTo(this.map); // measurement
     this.objects = L.layerGroup().addTo(this.map);
     this.hints = L.layerGroup().addTo(this.map);
+    this.start = L.layerGroup().addTo(this.map);
+    this.whole = info && [[info.bounds[1], info.bounds[0]], [info.bounds[3], info.bounds[2]]];
     this.onFrame = onFrame;
     this.follow = true;
     this.pick = null; // takes the next click
@@ -225,16 +240,34 @@ export class MapView {
 
   /** ``moves``: the flight goes on, and the map follows it. */
   show(model, selected, moves) {
-    const results = model.ordered;
-    this.track.show(results, selected);
-    if (!this.track.results.length) return;
-    if (!this.fitted) {
-      this.fit();
-      this.fitted = true;
-    } else if (this.follow && moves) {
-      const {lat, lon} = model.newestFix.gps;
-      if (!this.map.getBounds().pad(-0.15).contains([lat, lon])) this.map.panTo([lat, lon], {animate: !STILL.matches});
+    const lost = moves && model.newest !== null && placement(model.newest) === "unknown";
+    this.track.show(model.ordered, selected, lost);
+    this.showStart(model.flight.start);
+    const fix = model.newestFix;
+    const changed = this.lost !== lost;
+    this.lost = lost;
+    const must = (moves && this.follow) || !this.fitted;
+    if (!model.newest || !must) return;
+    const ellipse = fix?.ellipse && L.latLngBounds(square(fix.gps, 1.1 * fix.ellipse.semi_major_m));
+    if (lost) { // what the vehicle may be in, not the point in its middle
+      const bounds = ellipse ?? this.whole;
+      if (bounds && (changed || !this.map.getBounds().contains(bounds))) this.map.fitBounds(bounds, {maxZoom: 18.5, animate: false});
+    } else if (fix && (!this.fitted || changed)) this.fit();
+    else if (fix && ellipse && !this.map.getBounds().contains(ellipse)) {
+      const view = this.map.getBounds();
+      const fits = view.getNorth() - view.getSouth() > ellipse.getNorth() - ellipse.getSouth() && view.getEast() - view.getWest() > ellipse.getEast() - ellipse.getWest();
+      if (!fits) this.map.fitBounds(ellipse, {animate: false});
+      else if (!view.pad(-0.15).contains(fix.gps)) this.map.panTo(fix.gps, {animate: !STILL.matches});
     }
+    this.fitted = true;
+  }
+
+  /** Where the flight was said to begin. */
+  showStart(start) {
+    if (!start || this.start.getLayers().length) return;
+    L.circle(start, {radius: start.sigma_m, color: "#fff", weight: 2, dashArray: "4 4", fillOpacity: 0.08, interactive: false}).addTo(this.start);
+    L.circleMarker(start, {radius: 4, color: "#0a0e12", weight: 2, fillColor: "#fff", fillOpacity: 1, interactive: false})
+      .bindTooltip(t("start"), {direction: "right", offset: [6, 0], className: "measured", permanent: true}).addTo(this.start);
   }
 
   fit() {

@@ -15,6 +15,7 @@ export class FlightModel {
     this.facts = null; // of a live flight
     this.factsAt = 0; // ms
     this.statistics = null;
+    this.progress = null; // of the solution of the whole flight
     this.known = flight.last_event_id; // events up to this one happened before the page was opened, nobody knows when
     this.openedAt = Date.now();
     this.updatedAt = null; // ms: when the newest result came; null: before the page was opened
@@ -75,6 +76,9 @@ export class FlightModel {
       case "state_changed":
         this.flight.state = data.state;
         if (data.state === "processing" || data.state === "completed") this.request = null;
+        break;
+      case "finalise_progress":
+        this.progress = data;
         break;
       case "flight_completed":
         this.statistics = data.statistics;

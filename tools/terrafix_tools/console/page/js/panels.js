@@ -4,6 +4,7 @@ import {fill, h} from "./dom.js";
 import {NONE, bytes, clock, coordinate, metres, number, unit} from "./format.js";
 import {freshFacts} from "./glance.js";
 import {t} from "./texts.js";
+import {words} from "./words.js";
 
 const SHOWN = 200; // lines of a log
 
@@ -35,7 +36,7 @@ export class OverviewPanel {
       [t("map"), flight.map.state === "ready" ? flight.map.name : `${flight.map.name} ${t(`map_${flight.map.state}`)} ${flight.map.detail}`, flight.map.state === "failed" ? "bad" : ""],
       model.isLive ? null : [t("images"), t("images_done", number(flight.images.processed), number(flight.images.uploaded))],
       [t("frames_shown"), number(model.results.size)],
-      flight.start ? [t("start"), `${coordinate(flight.start)} ± ${metres(flight.start.sigma_m)} (1 σ)`] : [t("start"), t("no_start")],
+      flight.start ? [t("start"), `${coordinate(flight.start, flight.start.sigma_m)} ± ${metres(flight.start.sigma_m)} (1 σ)`] : [t("start"), t(model.isLive ? "live_start" : "no_start")],
     ];
     if (statistics) {
       rows.push([t("localised"), t("of", number(statistics.localised), number(statistics.frames))], [t("refined"), number(statistics.refined)],
@@ -43,7 +44,9 @@ export class OverviewPanel {
     }
     const parts = flight.fragments.map((one) => [number(one.fragment_id), `${one.first_frame} – ${one.last_frame}`, number(one.frames),
       one.joined ? t("joined") : td("warn", t("not_joined"))]);
-    fill(this.figures, pairs(rows), h("h3", {}, t("fragments")), table([t("fragment"), t("frames"), t("count"), t("tie")], parts, t("none_yet")));
+    const source = model.facts?.source;
+    const said = source ? [h("h3", {}, t("source_said")), pairs(source.map((one) => [one.topic, one.text]))] : null;
+    fill(this.figures, pairs(rows), h("h3", {}, t("fragments")), table([t("fragment"), t("frames"), t("count"), t("tie")], parts, t("none_yet")), said);
   }
 }
 
@@ -61,84 +64,67 @@ export class VerdictPanel {
 
   draw() {
     const wanted = this.model.verdicts.filter((one) => !this.only.checked || one.verdict !== "accepted");
-    const rows = wanted.slice(-SHOWN).reverse().map((one) => [number(one.frame_id), one.measurement,
-      td(one.verdict === "accepted" ? "good" : "bad", one.verdict === "accepted" ? "✓ " : "✕ ", one.verdict.replaceAll("_", " ")), number(one.test_ratio, 2), one.detail]);
+    const rows = wanted.slice(-SHOWN).reverse().map((one) => [one.file || number(one.frame_id), t(`measurement_${one.measurement.replaceAll(" ", "_")}`),
+      td(one.verdict === "accepted" ? "good" : "bad", one.verdict === "accepted" ? "✓ " : "✕ ", t(`verdict_${one.verdict}`)), number(one.test_ratio, 2), words(one.detail)]);
     fill(this.list, table([t("frame"), t("measurement"), t("verdict"), t("ratio"), t("detail")], rows, t("no_verdicts")));
   }
 }
 
-export class SystemPanel {
-  constructor() {
-    this.element = h("div", {});
-  }
-
-  update(model, health) {
-    const {facts} = model;
-    if (!model.isLive || !facts) {
-      fill(this.element, h("p", {class: "soft"}, model.isLive ? t("no_facts") : t("batch_system")), health ? this.service(health) : null);
-      return;
-    }
-    const {computer} = facts;
-    const hot = computer.throttled || computer.band === "critical";
-    const processes = facts.processes.map((one) => [one.name, td(one.state === "running" ? "good" : "bad", one.state === "running" ? "● " : "▲ ", t(`process_${one.state.replace(" ", "_")}`)),
-      unit(one.idle_s, 1, "s"), percent(one.load), number(one.restarts), one.last_event]);
-    const rates = Object.entries(facts.rates_hz).map(([name, rate]) => [name, unit(rate, 1, "Hz")]);
-    const dropped = Object.entries(facts.dropped).map(([name, count]) => [name, number(count), "warn"]);
-    fill(this.element, oldFacts(model),
-      h("h3", {}, t("processes")), table([t("process"), t("state"), t("progress"), t("load"), t("restarts"), t("last_event")], processes, t("none_yet")),
-      h("h3", {}, t("heat")), pairs([
-        [t("temperature"), [unit(computer.temperature_c, 1, "°C"), computer.band ? ` · ${computer.band}` : ""], hot ? "bad" : ""],
-        [t("throttled"), computer.throttled === null ? NONE : computer.throttled ? t("yes") : t("no"), computer.throttled ? "bad" : ""],
-        [t("load"), percent(computer.load)], [t("power"), unit(computer.power_w, 1, "W")],
-        [t("disk"), computer.disk_free_mb === null ? NONE : bytes(computer.disk_free_mb * 1e6)]]),
-      h("h3", {}, t("rates")), pairs([...rates, [t("delay"), unit(facts.delay_ms, 0, "ms")], [t("accepted_share"), percent(facts.map_matches_accepted)]]),
-      h("h3", {}, t("dropped")), dropped.length ? pairs(dropped) : h("p", {class: "soft"}, t("nothing_dropped")));
-  }
-
-  service(health) {
-    return pairs([[t("version"), health.version], [t("workers"), t("of", number(health.workers), number(health.max_workers))],
-      [t("waiting"), number(health.waiting)], [t("disk"), bytes(health.disk_free_mb * 1e6)]]);
-  }
-}
-
-export class AutopilotPanel {
+/** What the autopilot is sent and does with it, then the computer, of a live flight. */
+export class VehiclePanel {
   constructor() {
     this.element = h("div", {});
   }
 
   update(model) {
     const {facts} = model;
-    if (!facts) {
-      fill(this.element, h("p", {class: "soft"}, model.isLive ? t("no_facts") : t("batch_autopilot")));
-      return;
-    }
-    const {autopilot, position} = facts;
+    fill(this.element, facts ? [oldFacts(model), this.autopilot(facts), this.computer(facts)] : h("p", {class: "soft"}, t("no_facts")));
+  }
+
+  autopilot({autopilot, position, texts}) {
     const has = position.fix === "3D";
     const gnss = Object.entries(autopilot.gnss).map(([receiver, one]) => [receiver,
-      td(one.state === "spoofed" ? "bad" : one.state === "trusted" ? "good" : "", one.state), metres(one.distance_m), one.why]);
-    fill(this.element, oldFacts(model),
-      h("h3", {}, t("sent_title")), pairs([
-        [t("sent_fix"), has ? t("fix_3d") : `${t("fix_none")}: ${position.reason}`, has ? "good" : "bad"],
-        [t("accuracy"), has ? `± ${metres(position.accuracy_m)}` : NONE], [t("estimate_age"), unit(position.estimate_age_ms, 0, "ms")],
-        [t("degradation"), position.degradation ?? NONE], [t("covariance"), position.covariance_mode ?? NONE], [t("resets"), number(position.resets)],
-        [t("messages"), t("messages_line", number(autopilot.sent), number(autopilot.received), number(autopilot.bad_bytes), number(autopilot.refused))]]),
-      h("h3", {}, t("autopilot")), pairs([
-        [t("link"), autopilot.connected ? autopilot.autopilot : t("no_autopilot"), autopilot.connected ? "good" : "bad"],
-        [t("uses"), autopilot.uses_position === null ? NONE : autopilot.uses_position ? t("yes") : t("no"), autopilot.uses_position === false ? "bad" : ""],
-        [t("ekf_ratio"), number(autopilot.position_test_ratio, 2)], [t("ekf_source"), autopilot.position_source ?? NONE]]),
-      h("h3", {}, t("gnss")), table([t("receiver"), t("state"), t("distance"), t("why")], gnss, t("no_gnss")),
-      facts.texts.length ? [h("h3", {}, t("texts")), h("ul", {class: "lines"}, facts.texts.map((text) => h("li", {}, text)))] : null);
+      td(one.state === "spoofed" ? "bad" : one.state === "trusted" ? "good" : "", t(`gnss_${one.state}`)), metres(one.distance_m), words(one.why)]);
+    return [h("h3", {}, t("sent_title")), pairs([
+      [t("sent_fix"), has ? t("fix_3d") : `${t("fix_none")}: ${words(position.reason)}`, has ? "good" : "bad"],
+      [t("accuracy"), has ? `± ${metres(position.accuracy_m)}` : NONE], [t("estimate_age"), unit(position.estimate_age_ms, 0, "ms")],
+      [t("degradation"), position.degradation ?? NONE], [t("covariance"), position.covariance_mode ?? NONE], [t("resets"), number(position.resets)],
+      [t("messages"), t("messages_line", number(autopilot.sent), number(autopilot.received), number(autopilot.bad_bytes), number(autopilot.refused))]]),
+    h("h3", {}, t("autopilot")), pairs([
+      [t("link"), autopilot.connected ? autopilot.autopilot : t("no_autopilot"), autopilot.connected ? "good" : "bad"],
+      [t("uses"), autopilot.uses_position === null ? NONE : autopilot.uses_position ? t("yes") : t("no"), autopilot.uses_position === false ? "bad" : ""],
+      [t("ekf_ratio"), number(autopilot.position_test_ratio, 2)], [t("ekf_source"), autopilot.position_source ?? NONE]]),
+    h("h3", {}, t("gnss")), table([t("receiver"), t("state"), t("distance"), t("why")], gnss, t("no_gnss")),
+    texts.length ? [h("h3", {}, t("texts")), h("ul", {class: "lines"}, texts.map((text) => h("li", {}, text)))] : null];
+  }
+
+  computer(facts) {
+    const {computer} = facts;
+    const hot = computer.throttled || computer.band === "critical";
+    const processes = facts.processes.map((one) => [one.name, td(one.state === "running" ? "good" : "bad", one.state === "running" ? "● " : "▲ ", t(`process_${one.state.replace(" ", "_")}`)),
+      unit(one.idle_s, 1, "s"), percent(one.load), number(one.restarts), one.last_event]);
+    const rates = Object.entries(facts.rates_hz).map(([name, rate]) => [name, unit(rate, 1, "Hz")]);
+    const dropped = Object.entries(facts.dropped).map(([name, count]) => [name, number(count), "warn"]);
+    return [h("h3", {}, t("processes")), table([t("process"), t("state"), t("progress"), t("load"), t("restarts"), t("last_event")], processes, t("none_yet")),
+      h("h3", {}, t("heat")), pairs([
+        [t("temperature"), [unit(computer.temperature_c, 1, "°C"), computer.band ? ` · ${computer.band}` : ""], hot ? "bad" : ""],
+        [t("throttled"), computer.throttled === null ? NONE : computer.throttled ? t("yes") : t("no"), computer.throttled ? "bad" : ""],
+        [t("load"), percent(computer.load)], [t("power"), unit(computer.power_w, 1, "W")],
+        [t("disk"), computer.disk_free_mb === null ? NONE : bytes(computer.disk_free_mb * 1e6)]]),
+      h("h3", {}, t("rates")), pairs([...rates, [t("delay"), unit(facts.delay_ms, 0, "ms")], [t("accepted_share"), percent(facts.map_matches_accepted)]]),
+      h("h3", {}, t("dropped")), dropped.length ? pairs(dropped) : h("p", {class: "soft"}, t("nothing_dropped"))];
   }
 }
 
+const ofFrame = (d) => d.file || number(d.frame_id);
 const LINES = {
-  search_expanded: (d) => t("ev_search", number(d.frame_id), d.grid_size === null ? t("whole_map") : t("tiles", number(d.grid_size)), t(`searching_${d.status}`)),
-  user_input_needed: (d) => t("ev_input", number(d.frame_id)),
-  processing_blocked: (d) => t("ev_blocked", d.reason),
-  chunk_merged: (d) => t("ev_merged", number(d.fragment_id), number(d.frames), number(d.frame_id)),
+  search_expanded: (d) => t("ev_search", ofFrame(d), d.grid_size === null ? t("whole_map") : t("tiles", number(d.grid_size)), t(`searching_${d.status}`)),
+  user_input_needed: (d) => t("ev_input", ofFrame(d)),
+  processing_blocked: (d) => t("ev_blocked", words(d.reason)),
+  chunk_merged: (d) => t("ev_merged", number(d.fragment_id), number(d.frames), ofFrame(d)),
   state_changed: (d) => t("ev_state", t(`state_${d.previous}`), t(`state_${d.state}`)),
-  hint_answered: (d) => t("ev_hint", d.verdict, d.text),
-  finalise_progress: (d) => t("ev_finalise", d.stage, d.of === null ? d.done : t("of", d.done, d.of)),
+  hint_answered: (d) => t("ev_hint", t(`verdict_${d.verdict}`), words(d.text)),
+  finalise_progress: (d) => t("ev_finalise", t(`stage_${d.stage}`), d.of === null ? d.done : t("of", d.done, d.of)),
   flight_completed: () => t("ev_completed"),
 };
 
@@ -170,7 +156,7 @@ export class ObjectPanel {
 
   update() {
     fill(this.element, h("p", {class: "soft"}, t("objects_why")), table([t("fragment"), t("position"), t("accuracy95"), t("altitude"), t("surface")],
-      this.rows.map((one, i) => [number(i + 1), td("mono", coordinate(one.gps)), metres(one.accuracy_meters), unit(one.altitude, 1, "m"), t(`surface_${one.surface}`)]), t("none_yet")));
+      this.rows.map((one, i) => [number(i + 1), td("mono", coordinate(one.gps, one.accuracy_meters)), metres(one.accuracy_meters), unit(one.altitude, 1, "m"), t(`surface_${one.surface}`)]), t("none_yet")));
   }
 }
 

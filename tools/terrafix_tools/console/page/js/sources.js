@@ -10,6 +10,18 @@ export const SOURCES = {
 export const UNKNOWN = {shape: "circle", colour: "#9aa1a9", dash: [2, 5]};
 export const styleOf = (source) => SOURCES[source] ?? UNKNOWN;
 
+// Steps of the search in which the images contradict the position that was carried on.
+const SEARCHING = ["widen", "whole_map", "ask"];
+
+/** State of the position of a frame: "placed" (on the map, by a match of its own or by the flight solved as a whole),
+    "propagated" (carried on from there), "unknown". */
+export function placement(result) {
+  if (!result?.gps) return "unknown";
+  if (result.refined_by === "finalised" || result.refined_by === "flight") return "placed";
+  if (SEARCHING.includes(result.search) || (result.source === "not_placed" && !result.refined)) return "unknown";
+  return result.source === "satellite_anchored" ? "placed" : "propagated";
+}
+
 /** Adds the outline of a shape to the path of a canvas. */
 export function trace(context, shape, x, y, r) {
   context.beginPath();

@@ -7,7 +7,6 @@ import {t} from "./texts.js";
 
 export const BATCH = [10, 50];
 const TRIES = 8;
-const NUMBER = /(\d+)\.[^.]*$/;
 
 /** Sizes of the batches for n images: as few as possible, as equal as possible. */
 export function batchSizes(n) {
@@ -15,42 +14,28 @@ export function batchSizes(n) {
   return Array.from({length: count}, (_, i) => Math.floor((n + i) / count));
 }
 
-export const inOrder = (files) => [...files].sort((a, b) => a.name.localeCompare(b.name, "en", {numeric: true}));
-
-/** Whether each number at the end of the names is the one before plus one, beginning with next (null: any). */
-export function isSequence(names, next = null) {
-  const numbers = names.map((name) => Number(name.match(NUMBER)?.[1] ?? NaN));
-  return numbers.every((value, i) => value === (i ? numbers[i - 1] + 1 : next ?? value));
-}
-
-/** [{name, file}] as they are sent; with ``first`` under numbers of their own from there on. */
-export function named(files, first) {
-  return files.map((file, i) => ({
-    file,
-    name: first === null ? file.name : `image-${String(first + i).padStart(6, "0")}${file.name.match(/\.[^.]*$/)?.[0] ?? ".jpg"}`,
-  }));
-}
-
 /** Header and rows of a frames.csv by file name. Throws an Error: a column or a row is missing. */
-export function readTable(text, files) {
+export function readTable(text, photos) {
   const lines = text.replace(/^\uFEFF/, "").split(/\r?\n/).filter((line) => line.trim());
   if (!/^file\s*,/.test(lines[0] ?? "")) throw new Error(t("no_file_column"));
   const rows = new Map(lines.slice(1).map((line) => [line.slice(0, line.indexOf(",")).trim(), line.slice(line.indexOf(",") + 1)]));
-  const missing = files.find((file) => !rows.has(file.name));
+  const missing = photos.find((photo) => !rows.has(photo.name));
   if (missing) throw new Error(t("no_row", missing.name));
   return {header: lines[0], rows};
 }
 
 export class Upload {
-  /** images: result of ``named``; table: of ``readTable`` or null. ``element`` shows the progress. */
-  constructor(flightId, images, table) {
+  /** photos: as of photos.js; table: of ``readTable`` or null. ``element`` shows the progress. */
+  constructor(flightId, photos, table) {
     this.flightId = flightId;
-    this.images = images;
+    this.images = photos;
     this.table = table;
-    this.total = images.reduce((sum, image) => sum + image.file.size, 0);
+    this.total = photos.reduce((sum, photo) => sum + photo.size, 0);
+    this.stop = new AbortController();
+    this.cancel = h("button", {type: "button", onclick: () => this.stop.abort()}, t("cancel"));
     this.bar = h("progress", {max: 1, value: 0, "aria-label": t("upload")});
     this.line = h("p", {});
-    this.element = h("section", {class: "upload card"}, h("strong", {}, t("upload")), this.bar, this.line);
+    this.element = h("section", {class: "upload card"}, h("header", {}, h("strong", {}, t("upload")), this.cancel), this.bar, this.line);
   }
 
   async run() {
@@ -60,7 +45,7 @@ export class Upload {
     let done = 0;
     for (const [i, size] of sizes.entries()) {
       const batch = this.images.slice(at, at + size);
-      const weight = batch.reduce((sum, image) => sum + image.file.size, 0);
+      const weight = batch.reduce((sum, photo) => sum + photo.size, 0);
       const show = (sent) => this.show(done + Math.min(sent, weight), i, sizes.length, (performance.now() - began) / 1000);
       show(0);
       await this.send(batch, show);
@@ -68,6 +53,7 @@ export class Upload {
       done += weight;
     }
     this.show(this.total, sizes.length - 1, sizes.length, (performance.now() - began) / 1000);
+    this.cancel.hidden = true;
     this.line.textContent = t("upload_done", number(this.images.length), bytes(this.total));
     say(this.line.textContent);
   }
@@ -75,11 +61,12 @@ export class Upload {
   async send(batch, show) {
     for (let attempt = 0; ; attempt++) {
       try {
-        return await uploadBatch(this.flightId, this.form(batch), show);
+        return await uploadBatch(this.flightId, await this.form(batch), show, this.stop.signal);
       } catch (error) {
-        const again = error instanceof Problem && [0, 429, 503].includes(error.status);
+        const again = error instanceof Problem && [0, 429, 503].includes(error.status) && !this.stop.signal.aborted;
         if (!again || attempt === TRIES) {
-          this.line.textContent = error.message;
+          this.cancel.hidden = true;
+          this.line.textContent = this.stop.signal.aborted ? t("cancelled") : error.message;
           this.element.classList.add("bad");
           throw error;
         }
@@ -89,11 +76,11 @@ export class Upload {
     }
   }
 
-  form(batch) {
+  async form(batch) {
     const form = new FormData();
-    for (const {name, file} of batch) form.append("images", file, name);
+    for (const {name, get} of batch) form.append("images", await get(), name);
     if (this.table) {
-      const rows = batch.map(({name, file}) => `${name},${this.table.rows.get(file.name)}`);
+      const rows = batch.map(({name}) => `${name},${this.table.rows.get(name)}`);
       form.append("telemetry", new Blob([[this.table.header, ...rows].join("\n")], {type: "text/csv"}), "frames.csv");
     }
     return form;
