@@ -140,7 +140,7 @@ const DE = {
   frame_gone: "Dieses Einzelbild ist nicht mehr im Speicher.", frame_number: "Einzelbild {0}", frame_alt: "Kamerabild des Einzelbilds {0}", previous: "Vorheriges Einzelbild",
   next: "Nächstes Einzelbild", newest: "Neuestes", enlarge: "Groß oder klein", match_line: "Kartenabgleich: {0}{1}", inliers: " · {0} Punkte stimmen überein", no_match: "kein Kartenabgleich",
   locating: "Die Position des Bildpunkts wird berechnet …",
-  tab_overview: "Flug", tab_verdicts: "Urteile", tab_vehicle: "Fahrzeug", tab_log: "Verlauf", tab_objects: "Objekte", tab_export: "Ausgabe",
+  tab_overview: "Flug", tab_verdicts: "Urteile", tab_vehicle: "Fahrzeug", tab_log: "Verlauf", tab_objects: "Objekte", tab_export: "Export",
   images: "Bilder", frames_shown: "Einzelbilder mit Ergebnis", start: "Startpunkt", no_start: "nicht angegeben: die ganze Karte wird durchsucht", source_said: "Quelle", live_start: "nicht angegeben: über GNSS am Boden, oder auf der Karte gesucht", localised: "Lokalisiert",
   refined: "Nachträglich verfeinert", of: "{0} von {1}", median95: "Mittlerer 95-%-Radius", fragments: "Teilstücke", fragment: "Nr.", frames: "Einzelbilder", count: "Anzahl", tie: "Anbindung",
   joined: "mit dem Flug verbunden", not_joined: "noch nicht verbunden", none_yet: "Noch keine.", only_rejected: "Nur abgelehnte", measurement: "Messung", verdict: "Urteil",
