@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from terrafix.core.errors import OutputError
-from terrafix.recorder.foxglove import CHANNELS
+from terrafix.recorder.foxglove import FOXGLOVE_CHANNELS
 from terrafix.recorder.schema import TYPE_BY_TOPIC
 from terrafix_tools.cli import app
 
@@ -39,7 +39,7 @@ def test_a_path_names_a_message_and_its_field(path: str) -> None:
 
 
 def test_topics_are_those_of_a_record() -> None:
-    assert set(TOPICS) <= {*TYPE_BY_TOPIC, *CHANNELS} and len(TOPICS) == 4
+    assert set(TOPICS) <= {*TYPE_BY_TOPIC, *FOXGLOVE_CHANNELS} and len(TOPICS) == 4
 
 
 def test_each_panel_is_placed_once() -> None:
