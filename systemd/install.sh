@@ -19,7 +19,8 @@ while [ $# -gt 0 ]; do
         --prefix) prefix=$2; shift 2 ;;
         --no-pip) pip=no; shift ;;
         --package) package=$2; shift 2 ;;
-        *) echo "install.sh: unknown option $1; see the head of this file" >&2; exit 2 ;;
+        -h | --help) sed -n '2,/^set -eu/{/^#/s/^# \{0,1\}//p;}' "$0"; exit 0 ;;
+        *) echo "install.sh: unknown option $1; see --help" >&2; exit 2 ;;
     esac
 done
 if [ -z "$prefix" ] && [ "$(id -u)" -ne 0 ]; then
@@ -52,6 +53,8 @@ if [ "$pip" = yes ]; then
     # Without libsystemd-dev and a compiler it cannot be built; the log is then JSON in the text of the journal.
     "$install" install --constraint "$here/../requirements.lock" "${package}[vehicle]" ||
         echo "install.sh: no systemd-python (apt install libsystemd-dev gcc pkg-config): the journal gets no fields" >&2
+    # The wheel of gtsam requires what tests it; nothing that flies imports that.
+    "$install" uninstall --yes pytest pluggy iniconfig
 fi
 
 install -D -m 0644 "$here/terrafix.service" "$prefix/etc/systemd/system/terrafix.service"

@@ -12,6 +12,7 @@ Conventions
 """
 
 from enum import StrEnum
+from typing import NamedTuple
 
 import msgspec
 from msgspec import UNSET, UnsetType
@@ -125,6 +126,9 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True):
     mount_roll_deg: float = 0.0
     mount_tolerance_deg: float = 5.0  # 1-sigma of the true tilt about the nominal tilt
     gimbal: Gimbal | UnsetType = UNSET  # the camera is on it; unset: fixed to the vehicle
+    # Rolling shutter: time from the exposure of the first row to that of the last; ``t_ns`` of a Frame is that of the
+    # middle row. Unset: all rows are exposed at once.
+    readout_s: float | UnsetType = UNSET
 
 
 class Origin(Message, frozen=True, kw_only=True):
@@ -138,6 +142,20 @@ class Origin(Message, frozen=True, kw_only=True):
     yaw_sigma_deg: float
     agl_sigma_m: float
     attitude_sigma_deg: float  # of reported roll and pitch
+    flight_id: str = ""  # UUID; with the number of a frame it names that frame over all flights (core/flight_id.py)
+
+
+class Fact(NamedTuple):
+    # "camera", "mount", "start", "height", "heading", "tilt", "clock", "exposure", "rate", "vehicles", "left out"
+    topic: str
+    text: str
+
+
+class SourceFacts(Message, frozen=True, kw_only=True):
+    """What the source says of itself when it is opened: where each number comes from, what is assumed, and what is left
+    out and why. Published after Origin."""
+
+    facts: tuple[Fact, ...]
 
 
 OVERTAKEN = "overtaken: a newer frame was there first"  # error of a frame that was left out, not of the camera
@@ -191,6 +209,13 @@ class GimbalAttitude(Message, frozen=True, kw_only=True):
     q: Quat  # from its axes (along the view, right, down) to north, east, down, or to heading, right, down
     from_north: bool  # False: yaw is from the heading of the vehicle
     device: int = 0  # gimbal_device_id, or component id of the gimbal; 0: the message names none
+
+
+class Exposure(Message, frozen=True, kw_only=True):
+    """The autopilot reports that a camera has exposed an image at ``t_ns``."""
+
+    kind: str  # CAMERA_FEEDBACK, CAMERA_IMAGE_CAPTURED, CAMERA_TRIGGER
+    number: int  # as its sender counts
 
 
 class SourceEnded(Message, frozen=True, kw_only=True):
@@ -263,6 +288,13 @@ class Relocalization(Message, frozen=True, kw_only=True):
 # --- estimator to anchor --------------------------------------------------------------------------
 
 
+class ReadoutMotion(msgspec.Struct, frozen=True, kw_only=True):
+    """How a camera with a rolling shutter moved at a frame, in its own axes."""
+
+    rate_radps: Vec3
+    speed_per_s: Vec3  # velocity over the height above ground
+
+
 class Prediction(Message, frozen=True, kw_only=True):
     """Predicted camera pose at frame ``frame_id`` (the prior for map matching), without a map match of that frame."""
 
@@ -280,6 +312,7 @@ class Prediction(Message, frozen=True, kw_only=True):
     prior_t_ns: int = 0  # t_ns of the InitialPosition or EkfDeadReckoning that reset the position; 0: no reset
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
     joined: bool = True  # something other than dead reckoning ties that fragment to the flight; True without a fragment
+    readout_motion: ReadoutMotion | UnsetType = UNSET  # of a camera with a rolling shutter, where it is known
 
 
 # --- anchor ---------------------------------------------------------------------------------------
@@ -510,6 +543,7 @@ class NavEstimate(Message, frozen=True, kw_only=True):
     emitted_at_ns: int  # time of publication; in a replay, the time of the frame
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
     joined: bool = True  # ... is joined to the flight (as in Prediction)
+    frame_uid: str = ""  # UUID of the flight and number of the frame; empty: the flight has no id
 
     @property
     def is_placed(self) -> bool:
@@ -664,6 +698,9 @@ class Refinement(Message, frozen=True, kw_only=True):
     source: RefinementSource = RefinementSource.FLIGHT
 
 
+NO_FRAME_ID = -1  # frame_id of a verdict that belongs to no frame
+
+
 class MeasurementVerdict(Message, frozen=True, kw_only=True):
     """Result of the checks of one measurement. Every rejection has one (law 3); of heights and headings only those."""
 
@@ -686,6 +723,9 @@ class MeasurementVerdict(Message, frozen=True, kw_only=True):
 
 
 # --- link -----------------------------------------------------------------------------------------
+
+
+NO_FIX, FIX_2D, FIX_3D = 1, 2, 3  # GPS_FIX_TYPE of MAVLink's common.xml
 
 
 class GpsInput(Message, frozen=True, kw_only=True):
@@ -828,6 +868,8 @@ class EkfStatus(Message, frozen=True, kw_only=True):
     flags: int  # EKF_STATUS_FLAGS
     position_ratio: float  # horizontal innovation over its gate (test ratio): 1 is the limit
     velocity_ratio: float
+    lat_deg: float | None = None  # its own horizontal position, not more than a second old; None: it reports none
+    lon_deg: float | None = None
 
 
 class WallClock(Message, frozen=True, kw_only=True):
@@ -938,10 +980,12 @@ class LogLine(Message, frozen=True, kw_only=True):
 
 AnyMessage = (
     Origin
+    | SourceFacts
     | Frame
     | VehicleState
     | Imu
     | GimbalAttitude
+    | Exposure
     | SourceEnded
     | Odometry
     | Relocalization

@@ -30,10 +30,12 @@ OPERATOR = "operator"  # a command on this computer that publishes PositionHint;
 
 ALL_MESSAGES: tuple[type[m.Message], ...] = (
     m.Origin,
+    m.SourceFacts,
     m.Frame,
     m.VehicleState,
     m.Imu,
     m.GimbalAttitude,
+    m.Exposure,
     m.SourceEnded,
     m.Odometry,
     m.Relocalization,
@@ -99,6 +101,7 @@ PROCESSES: tuple[Process, ...] = (
             m.VehicleState,
             m.Imu,
             m.GimbalAttitude,
+            m.Exposure,
             m.PositionHint,
             m.EkfDeadReckoning,
             m.GpsInput,
@@ -178,9 +181,10 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "vision",
         "terrafix.vision.node",
-        (m.Origin, m.Frame, m.Health),
+        (m.Origin, m.Frame, m.Health, m.Exposure),
         (
             m.Origin,
+            m.SourceFacts,
             m.Frame,
             m.VehicleState,
             m.Imu,

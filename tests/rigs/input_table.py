@@ -51,6 +51,7 @@ MAP_INPUTS: tuple[Row, ...] = (
         "ellipsoidal heights without a grid",
         ("map/inputs/test_elevation_units.py", (
             "test_ellipsoidal_heights_of_the_file_are_converted_or_refused",
+            "test_a_vertical_system_with_the_name_of_an_ellipsoid_counts_from_it",
             "test_what_is_assumed_of_a_plain_file_is_in_the_manifest_and_in_map_check",
         )),
     ),
@@ -87,7 +88,8 @@ MAP_INPUTS: tuple[Row, ...] = (
         "alpha instead of nodata; a nodata value that the pixels cannot hold is ignored",
         "an image without a valid pixel",
         ("map/inputs/test_image_masks.py", (
-            "test_alpha_wins_over_nodata", "test_nodata_that_8_bits_cannot_hold_is_ignored_with_a_word",
+            "test_alpha_wins_over_nodata", "test_an_alpha_band_in_any_place_is_the_mask",
+            "test_nodata_that_8_bits_cannot_hold_is_ignored_with_a_word",
             "test_a_collar_is_found_on_every_grid", "test_a_warped_source_of_a_mosaic_has_no_collar_either",
             "test_the_masks_of_the_field",
         )),
@@ -105,12 +107,13 @@ MAP_INPUTS: tuple[Row, ...] = (
     ),
     Row(
         "area", "KML (any encoding, KMZ, gx:Track, DJI's way points), GeoJSON, a box", "degrees", "WGS 84",
-        "points alone are a path in their order; points beside outlines are left out",
-        "decimal commas; a single point",
+        "points alone are a path in their order; points beside outlines and links to other documents are left out",
+        "decimal commas; a single point; a link alone",
         ("map/inputs/test_area_files.py", (
             "test_a_kml_is_read_in_its_encoding_declared_or_not",
             "test_spaces_behind_commas_are_read_and_decimal_commas_refused",
-            "test_a_track_and_the_points_of_a_planner_are_paths", "test_an_archive_is_read_by_its_document",
+            "test_a_track_and_the_points_of_a_planner_are_paths", "test_a_link_to_another_document_is_named",
+            "test_an_archive_is_read_by_its_document",
             "test_every_area_of_the_field_has_its_size_or_is_refused",
         )),
     ),
@@ -167,7 +170,8 @@ FLIGHT_INPUTS: tuple[Row, ...] = (
         "XMP of DJI (gimbal), Autel and Pix4D (Camera), Parrot",
         "degrees",
         "true north; DJI: pitch from the horizon; Pix4D: from straight down, below -45 from the horizon",
-        "1-sigma of the tilt 9 degrees, unless flight.toml says it; 0/0/0, headings that are all zero: not reported",
+        "1-sigma of the tilt 9 degrees, unless flight.toml says it; 0/0/0, headings that are all zero: not reported; "
+        "yaws of gimbal and flight more than 30 degrees apart are the 1-sigma of the heading",
         "-",
         (
             "vision/test_photo_makers.py",
@@ -176,6 +180,7 @@ FLIGHT_INPUTS: tuple[Row, ...] = (
                 "test_gimbal_angles_of_zero_leave_the_flights_heading_and_a_wide_mount",
                 "test_a_stated_accuracy_of_the_tilt_replaces_that_of_photos",
                 "test_what_is_exactly_zero_in_all_photos_is_not_reported",
+                "test_a_gimbal_yaw_far_from_that_of_the_flight_widens_the_heading",
             ),
         ),
     ),
@@ -255,6 +260,34 @@ FLIGHT_INPUTS: tuple[Row, ...] = (
                 "test_lost_zero_and_foreign_bytes_are_skipped_and_counted",
                 "test_a_text_log_of_2013_has_its_times_from_the_gps_and_names_of_modes",
                 "test_what_has_no_whole_format_is_no_log",
+            ),
+        ),
+    ),
+    Row(
+        "telemetry of GoPro",
+        "GPMF in the video: GPS5, GPS9",
+        "degrees",
+        "WGS 84",
+        "positions are truth; inertial streams and orientation are not read, since their axes are not stated",
+        "-",
+        ("vision/test_source_gpmf.py", ("test_positions_of_a_gopro_are_truth_at_the_times_of_the_frames",)),
+    ),
+    Row(
+        "topics of a ROS bag",
+        "types, mavros's names; `--topic`, `[source] topics`",
+        "SI; headings in degrees",
+        "east, north, up; forward, left, up (REP 103, 145)",
+        "a true heading in the orientation of Imu; stamps 10 s from the time of recording are of another clock; an "
+        "orientation that never changes: not reported; NavSatFix is not read",
+        "several topics of a kind; no images; no CameraInfo",
+        (
+            "vision/test_source_rosbag.py",
+            (
+                "test_telemetry_of_a_bag_is_in_the_axes_of_the_vehicle",
+                "test_several_topics_are_asked_for_and_chosen",
+                "test_stamps_of_another_clock_give_way_to_the_times_of_recording",
+                "test_an_orientation_that_never_changes_is_not_reported",
+                "test_positions_of_a_bag_are_truth_and_nothing_else",
             ),
         ),
     ),

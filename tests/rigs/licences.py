@@ -36,9 +36,12 @@ NAMED = {
     "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
     "Python Software Foundation License": "PSF-2.0",
     "The Unlicense (Unlicense)": "Unlicense",
+    "any-OSI": "Zlib",  # of apsw: any licence of the Open Source Initiative, this one was its first
 }
-# Extras that the check does not install, because they need a compiler or a GPU: read on their pages.
+# Extras that the check does not install, because they need a compiler or a GPU, or are for one
+# export: read on their pages.
 ELSEWHERE = {
+    "rosbags": "Apache-2.0",
     "pygobject": "LGPL-2.1-or-later",
     "systemd-python": "LGPL-2.1-or-later",
     "torch": "BSD-3-Clause",

@@ -11,7 +11,6 @@ import numpy as np
 
 from origins import origin_of
 from terrafix import messages as m
-from terrafix.core.codec import encode_json
 from terrafix.core.errors import LinkError
 from terrafix.core.frames import FrameWriter
 from terrafix.core.node import Edge, Node, NodeContext
@@ -139,7 +138,7 @@ class FileEdge:
         return ()
 
     def on_message(self, message: m.Message) -> None:
-        self._file.write(encode_json(message) + b"\n")
+        self._file.write(msgspec.json.encode(message) + b"\n")
 
     def close(self) -> None:
         self._file.close()

@@ -2,6 +2,7 @@
 and the fault matrix share: each of CRITERIA is measured by all of them."""
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -19,7 +20,11 @@ AGAIN_RADIUS_M = 30.0  # ... and claimed: 95 % radius [spec: right and claimed a
 @dataclass(frozen=True)
 class Track:
     """``t_s`` (N,), ``error_m`` (N,) horizontal, nan: no position; ``nees`` (N,); ``sigma_m`` (N,) claimed, of the
-    worst axis. ``fault``: its span; None: no input is false. ``frames_s``: times of the frames, if not ``t_s``."""
+    worst axis. ``fault``: its span; None: no input is false. ``frames_s``: times of the frames, if not ``t_s``.
+
+    Of a flight with a record: ``told``: when the pilot got which text; ``untrusted``: spans that the verdict of the
+    report does not trust, with its reason; ``refused``: those in which it names the pictures that were not used;
+    ``cause``: regular expression for what both call the fault."""
 
     t_s: np.ndarray
     error_m: np.ndarray
@@ -27,6 +32,10 @@ class Track:
     sigma_m: np.ndarray
     fault: Span | None
     frames_s: Sequence[float] = ()
+    told: Sequence[tuple[float, str]] = ()
+    untrusted: Sequence[Span] = ()
+    refused: Sequence[Span] = ()
+    cause: str = ""
 
     def is_false(self, beyond_m: float = FALSE_FIX_ERROR_M) -> np.ndarray:
         """(N,) bool"""
@@ -57,15 +66,45 @@ class Track:
         steady = np.convolve(right, np.ones(AGAIN_FRAMES), "valid") == AGAIN_FRAMES
         return float(self.t_s[after][np.argmax(steady)] - self.fault.to_s) if steady.any() else math.inf
 
+    @property
+    def is_right_again(self) -> bool:
+        again_s = self.again_s()
+        return again_s is not None and again_s < math.inf
+
+    def told_s(self) -> float | None:
+        """From the beginning of the fault to the first text with its cause; inf: never; None: it has no cause."""
+        return self._named_s([t_s for t_s, text in self.told if re.search(self.cause, text)])
+
+    def verdict_s(self) -> float | None:
+        """From the beginning of the fault to where the verdict names its cause; inf: nowhere; None: it has none."""
+        if self.fault is None:
+            return None
+        begin_s = self.fault.from_s
+        spans = [s for s in [*self.untrusted, *self.refused] if re.search(self.cause, s.text) and s.to_s >= begin_s]
+        return self._named_s([max(begin_s, span.from_s) for span in spans])
+
+    def trusted_wrong(self) -> float | None:
+        """Positions beyond LATE_M and 3 sigma that the verdict of the report trusts; None: there is no report."""
+        if not self.told and not self.untrusted:
+            return None
+        trusted = [not any(span.has(t_s) for span in self.untrusted) for t_s in self.t_s.tolist()]
+        return float((self.is_false(LATE_M) & np.array(trusted, bool)).sum())
+
+    def _named_s(self, times_s: Sequence[float]) -> float | None:
+        if self.fault is None or not self.cause:
+            return None
+        return min((t_s - self.fault.from_s for t_s in times_s if t_s >= self.fault.from_s), default=math.inf)
+
 
 @dataclass(frozen=True)
 class TrackCriterion:
-    """``of``: what is shown of several flights."""
+    """``of``: what is shown of several flights. ``live``: of flights with the real processes alone."""
 
     what: str
     unit: str
     measure: Callable[[Track], float | None]
     of: Callable[[Sequence[float]], float] = max
+    live: bool = False
 
 
 CRITERIA = {
@@ -74,13 +113,23 @@ CRITERIA = {
         lambda track: float(track.is_late(LATE_M).sum()), sum),
     "right again": TrackCriterion(
         "from the end of the fault until within 20 m and claimed to 30 m (95 %), three in a row", "s", Track.again_s),
+    "told": TrackCriterion(
+        "from the beginning of the fault to the text to the pilot that names its cause", "s", Track.told_s, live=True),
+    "in the verdict": TrackCriterion(
+        "from the beginning of the fault to the span that the verdict names by its cause", "s", Track.verdict_s,
+        live=True),
+    "trusted and wrong": TrackCriterion(
+        "positions beyond 20 m and 3 sigma in a span that the verdict trusts", "", Track.trusted_wrong, sum, live=True),
 }  # fmt: skip
 
 
 def measured(tracks: Sequence[Track]) -> dict[str, str]:
     """Of one flight or of several together: name of CRITERIA -> value with its unit; "-": not measurable."""
     found = {}
+    live = any(track.told or track.untrusted for track in tracks)
     for name, row in CRITERIA.items():
+        if row.live and not live:
+            continue
         values = [value for track in tracks if (value := row.measure(track)) is not None]
         never = sum(map(math.isinf, values))
         shown = (

@@ -30,6 +30,7 @@ EXTRAS = {
         "terrafix_tools.console",
     ),
     "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "yaml", "terrafix_"),
+    "rosbag": ("rosbags",),
 }  # fmt: skip
 # a full disk, or one over its quota
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
@@ -37,6 +38,8 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 # Commands of modules of their own: a function, or a Typer app with commands below it. Imported when they are called, so
 # that a start in flight is fast. The lab is named here and imported by nothing: it may not be installed.
 MODULES = {
+    "init": "terrafix_tools.configuration.cli:init",
+    "config": "terrafix_tools.configuration.cli:app",
     "preflight": "terrafix_tools.preflight.cli:preflight",
     "status": "terrafix_tools.status.cli:status",
     "hint": "terrafix_tools.hint.cli:hint",
@@ -63,7 +66,7 @@ MODULES = {
 # Of the help, in the order of a flight. A command that is in none is a mistake (tests/unit/project/test_cli_help.py).
 GROUPS = {
     "Fly": ("run", "status", "hint"),
-    "Before a flight": ("preflight", "camera", "source", "files", "models"),
+    "Before a flight": ("init", "config", "preflight", "camera", "source", "files", "models"),
     "After a flight": ("replay", "report", "evaluate", "finalise", "log", "compare", "locate", "fleet"),
     "Photos and flights over HTTP": ("serve", "flight"),
     "Maps": ("map",),
@@ -195,7 +198,7 @@ def run(
 
 @app.command()
 def replay(
-    flight: Annotated[Path, typer.Argument(help="Flight folder, photo folder, video, or flight record.")],
+    flight: Annotated[Path, typer.Argument(help="Flight folder, photo folder, video, ROS bag, or flight record.")],
     map_path: Annotated[
         Path | None, typer.Option("--map", help="Map package or GeoTIFF; default: the flight's.")
     ] = None,
@@ -205,6 +208,7 @@ def replay(
     model: Annotated[list[str] | None, typer.Option(help="Name of a fetched model (xfeat), or NAME=PATH.")] = None,
     start: StartOption = "",
     config: ConfigOption = None,
+    topic: Annotated[list[str] | None, typer.Option(help="KIND=TOPIC of a ROS bag: docs/flight-folder.md.")] = None,
     frames: Annotated[
         bool, typer.Option("--frames", help="Of a record with frames: compute vision and map matching again, too.")
     ] = False,
@@ -215,12 +219,13 @@ def replay(
     A flight record (.mcap, or the folder of a run) is replayed from its messages: the estimator computes again. With
     --frames all of it is computed again from its frames, also with another map, model or configuration."""
     from terrafix.recorder.reader import is_record
-    from terrafix.vision.sources import parse_start
+    from terrafix.vision.sources import parse_start, parse_topics
+    from terrafix.vision.sources.bag_topics import is_bag
     from terrafix_tools.replay import replay as run_replay
     from terrafix_tools.rerun.frames import RecordedFrames
 
     source: Path | RecordedFrames = flight
-    if is_record(flight):
+    if is_record(flight) and not is_bag(flight):
         if not frames:
             _replay_from_messages(flight, out, other_inputs=bool(map_path or model or start or config), quiet=quiet)
             return
@@ -237,6 +242,7 @@ def replay(
         configs=config or [],
         progress=not quiet,
         start=parse_start(start),
+        topics=parse_topics(topic or []),
     )
     if summary["verdict"]["active_faults"]:
         raise typer.Exit(1)
@@ -309,7 +315,9 @@ def main(fork_server: "ForkServer | None" = None) -> None:
         if not extra:
             raise
         missing = "terrafix-ground" if name.startswith("terrafix") else name.split(".")[0]
-        typer.echo(f"terrafix: this command needs {missing}; install it: pip install 'terrafix[{extra}]'", err=True)
+        from terrafix_tools.installation import install_command
+
+        typer.echo(f"terrafix: this command needs {missing}; install it: {install_command(extra)}", err=True)
         sys.exit(UsageError.exit_code)
 
 

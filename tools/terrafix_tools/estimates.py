@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TextIO
 
 from terrafix.core.errors import EvaluationError
+from terrafix.core.flight_id import frame_uid
 from terrafix.core.geodesy import rot_from_quat, yaw_of
-from terrafix.messages import Frame, Message, NavEstimate, RefinedPose, Refinement
+from terrafix.messages import Frame, Message, NavEstimate, Origin, RefinedPose, Refinement
 
 
 @dataclass
@@ -39,6 +40,7 @@ class Row:
     refined_cov: str = ""
     refined_m_per_unit: float | None = None
     refined_fragment_id: int | None = None
+    frame_uid: str = ""
 
     @property
     def localised(self) -> bool:
@@ -64,7 +66,7 @@ DIGITS: dict[str, int] = {
     "refined_alt_amsl_m": 3,
     "refined_m_per_unit": 4,
 }
-_TEXT = ("file", "source_label", "covariance_mode", "refined_q_w_c", "refined_cov")
+_TEXT = ("file", "source_label", "covariance_mode", "refined_q_w_c", "refined_cov", "frame_uid")
 _INTEGERS = ("anchor_age_ms", "refined_fragment_id")
 _REQUIRED = ("file", "lat_deg", "lon_deg", "sigma_e_m", "sigma_n_m", "cov_en_m2")
 NS = 1_000_000_000
@@ -83,10 +85,14 @@ class RowTable:
 
     def __init__(self) -> None:
         self.rows: dict[int, Row] = {}  # by frame id, in order of arrival
+        self._flight_id = ""
 
     def take(self, message: Message) -> None:
-        if isinstance(message, Frame):
-            self.rows.setdefault(message.frame_id, Row(file=message.file, t_s=message.t_ns / NS))
+        if isinstance(message, Origin):
+            self._flight_id = message.flight_id
+        elif isinstance(message, Frame):
+            uid = frame_uid(self._flight_id, message.frame_id)
+            self.rows.setdefault(message.frame_id, Row(file=message.file, t_s=message.t_ns / NS, frame_uid=uid))
         elif isinstance(message, NavEstimate) and message.frame_id in self.rows:
             self._estimate(self.rows[message.frame_id], message)
         elif isinstance(message, Refinement):

@@ -22,6 +22,29 @@ from terrafix_tools.score import FALSE_FIX_ERROR_M, coverage, error_summary, is_
 
 WEIGHTS_FREE = "gradient"  # beginning of MapMatch.matcher of a frame for which no learned model ran
 _GEOD = Geod(ellps="WGS84")
+# The keys of evaluation.json in words, for the table
+WORDS = {
+    "within_5m": "frames within 5 m",
+    "within_10m": "frames within 10 m",
+    "within_20m": "frames within 20 m",
+    "within_50m": "frames within 50 m",
+    "median_m": "median error",
+    "p95_m": "95 % of the errors are below",
+    "max_m": "largest error",
+    "ellipse95_coverage": "truth in the 95 % ellipse",
+    "mean_nees": "mean squared Mahalanobis distance (2: exact claims)",
+    "false_fixes": "false fixes: over 50 m wrong, and claimed to be right",
+    "anchor_rate": "frames whose own map match was accepted",
+    "odometry_rate": "frames registered by odometry",
+    "model_rate": "map matches for which the learned model ran",
+    "frame_ms_median": "time of a frame, median",
+    "frame_ms_p95": "time of a frame, 95 % are below",
+    "refined": "frames with a refined position",
+    "frames_without_truth": "frames without truth",
+    "covariance_invalid": "claims that are no covariance",
+    "truth_sigma_m": "error of the truth itself, 1-sigma",
+    "ellipse95_coverage_with_truth_sigma": "truth in the 95 % ellipse, with its own error",
+}
 
 
 @dataclass(frozen=True)
@@ -245,5 +268,7 @@ def _table(result: dict[str, Any], folder: Path) -> Table:
         if key.startswith(("refined_", "finalised")) or key in ("frames", "localised"):
             continue
         others = [f"{stage}_{key}" for stage in ("refined", "finalised")]
-        table.add_row(key, _format(key, value), *(_format(o, result[o]) if o in result else "" for o in others))
+        table.add_row(
+            WORDS.get(key, key), _format(key, value), *(_format(o, result[o]) if o in result else "" for o in others)
+        )
     return table

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafix.core.errors import MapError
+from terrafix_tools.installation import install_command
 
 
 def map_of_flight(folder: Path, given: Path | None, summary: dict[str, Any], header: dict[str, Any]) -> Path | None:
@@ -28,7 +29,7 @@ def package_of(path: Path, *, progress: bool = False) -> Path:
     except ModuleNotFoundError:
         raise MapError(
             f"{path}: no map package (.gpkg); this installation makes none: use `terrafix map build` on the ground, or "
-            "pip install 'terrafix[ground]'"
+            f"{install_command('ground')}"
         ) from None
 
     return ensure_package(path, map_cache_dir(), progress=progress)

@@ -22,6 +22,8 @@ MAX_UNANCHORED_S = DEGRADATION_LEVELS[-1][0]  # longest time without a map match
 MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejected by the estimator's innovation gate
 # Faults that begin in flight; all others are of the description, which was wrong from the beginning.
 BEGIN_IN_FLIGHT = ("registration", "picture upside down", "picture turned", "picture mirrored")
+# Faults whose pictures were refused: the position went on without them, at a claim of its own.
+REFUSED = ("picture frozen", "picture contradicts motion", "picture without texture")
 # One of map and initial position is wrong; no measurement on board decides which.
 START_CONTRADICTS_MAP = "start and map contradict each other: one of them is in the wrong place"
 MAX_SHOWN_SPANS = 3
@@ -41,6 +43,8 @@ class FlightVerdict:
     cause: str = ""  # the likely one, of a flight that found nothing on the map
     files: tuple[tuple[str, str], ...] = ()
     untrusted_files: tuple[tuple[str, str], ...] = ()
+    untrusted: tuple[tuple[float, float, str], ...] = ()  # as ``spans``, of the rest: from, to, reason
+    refused: tuple[tuple[float, float, str], ...] = ()  # of refused pictures, whatever was trusted: from, to, which
 
     @property
     def label(self) -> str:
@@ -48,9 +52,24 @@ class FlightVerdict:
             return "do not trust it"
         return "trust it" if self.share == 1.0 else "trust it in part"
 
+    @property
+    def is_trusted(self) -> bool:
+        """All of the flight is."""
+        return bool(self.spans) and self.share == 1.0
+
+    def since(self, zero_s: float) -> "FlightVerdict":
+        """The same with times since ``zero_s``."""
+        spans = [(a - zero_s, b - zero_s) for a, b in self.spans]
+        untrusted, refused = (
+            tuple((a - zero_s, b - zero_s, why) for a, b, why in given) for given in (self.untrusted, self.refused)
+        )
+        return replace(self, spans=spans, untrusted=untrusted, refused=refused)
+
     def text(self) -> str:
         """One line for the operator."""
-        because = f" ({'; '.join(self.reasons)})" if self.reasons else ""
+        refused = [f"{what} from {a:.1f} s to {b:.1f} s" for a, b, what in self.refused[:MAX_SHOWN_SPANS]]
+        refused += ["..."] if len(self.refused) > MAX_SHOWN_SPANS else []
+        because = f" ({'; '.join([*self.reasons, *refused])})" if self.reasons or refused else ""
         cause = f" Likely cause: {self.cause}." if self.cause else ""
         if not self.spans or self.share == 1.0:
             return f"{self.label.capitalize()}{because}.{cause}"
@@ -68,6 +87,8 @@ class FlightVerdict:
         return {
             "verdict": self.label,
             "trusted_s": [[round(a, 3), round(b, 3)] for a, b in self.spans],
+            "untrusted_s": [[round(a, 3), round(b, 3), reason] for a, b, reason in self.untrusted],
+            "refused_s": [[round(a, 3), round(b, 3), what] for a, b, what in self.refused],
             "trusted_files": [list(pair) for pair in self.files],
             "untrusted_files": [list(pair) for pair in self.untrusted_files],
             "trusted_share": round(self.share, 6),
@@ -88,14 +109,21 @@ def flight_verdict(
     """
     ordered = sorted(faults, key=lambda fault: fault[0])
     active: dict[str, tuple[float, CalibrationFault]] = {}
-    faulty_spans: list[tuple[float, float, str]] = []
+    ended: list[tuple[float, CalibrationFault, float]] = []
     for t_s, fault in ordered:
         if fault.active:
             active.setdefault(fault.quantity, (t_s, fault))
         elif fault.quantity in active:
             began_s, first = active.pop(fault.quantity)
-            faulty_spans.append((_fault_start_s(began_s, first, rows), t_s, _fault_name(first)))
-    faulty_spans += [(_fault_start_s(t_s, fault, rows), math.inf, _fault_name(fault)) for t_s, fault in active.values()]
+            ended.append((began_s, first, t_s))
+    every = [*ended, *((t_s, fault, math.inf) for t_s, fault in active.values())]
+    faulty_spans = [
+        (_fault_start_s(a, fault, rows), b, _fault_name(fault))
+        for a, fault, b in every
+        if fault.quantity not in REFUSED
+    ]
+    last_s = rows[-1].t_s if rows else 0.0
+    refused = sorted((a, min(b, last_s), fault.quantity) for a, fault, b in every if fault.quantity in REFUSED)
     verdict_counts = verdicts or {}
     rejected = (
         START_CONTRADICTS_MAP if verdict_counts.get("start") else _rejected_matches(verdict_counts.get("map", {}))
@@ -110,22 +138,28 @@ def flight_verdict(
         files[trusted].append((span[0].file, span[-1].file))
         if trusted:
             spans.append((span[0].t_s, span[-1].t_s))
+    untrusted = [
+        (part[0].t_s, part[-1].t_s, reason)
+        for reason, part_pairs in groupby(zip(rows, distrust, strict=True), key=lambda pair: pair[1])
+        if reason and (part := [pair[0] for pair in part_pairs])
+    ]
     reasons = list(dict.fromkeys(reason for reason in distrust if reason))
     if not rows:
         reasons = ["no frame"]
     share = sum(not reason for reason in distrust) / max(len(rows), 1)
     anchored = sum(row.anchor_age_ms == 0 for row in rows)
     cause = likely_cause(len(rows), anchored, (fault for _, fault in ordered), verdict_counts)
-    names = [_fault_name(fault) for _, fault in active.values()]
-    return FlightVerdict(spans, share, reasons, names, cause, tuple(files[True]), tuple(files[False]))
+    names = [_fault_name(fault) for _, fault in active.values() if fault.quantity not in REFUSED]
+    return FlightVerdict(
+        spans, share, reasons, names, cause, tuple(files[True]), tuple(files[False]), tuple(untrusted), tuple(refused)
+    )
 
 
-def verdict_of(folder: Path) -> FlightVerdict:
-    """Returns the verdict for the record in a folder, with times since the origin of the flight. Raises SourceError
-    when there is none.
+def verdict_of(folder: Path, zero_s: float | None = None) -> FlightVerdict:
+    """Returns the verdict for the record in a folder, with times since ``zero_s`` of its messages (None: the
+    origin of the flight). Raises SourceError when there is none.
     """
     table = RowTable()
-    zero_s: float | None = None
     faults: list[tuple[float, CalibrationFault]] = []
     verdicts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for _, _, message in read_flight(folder):
@@ -137,7 +171,7 @@ def verdict_of(folder: Path) -> FlightVerdict:
         elif isinstance(message, MeasurementVerdict):
             verdicts[message.measurement][str(message.verdict)] += 1
     found = flight_verdict(list(table.rows.values()), faults, verdicts)
-    return replace(found, spans=[(a - (zero_s or 0.0), b - (zero_s or 0.0)) for a, b in found.spans])
+    return found.since(zero_s or 0.0)
 
 
 def _moment(t_s: float, file: str) -> str:

@@ -13,17 +13,18 @@ from typing import Any
 
 import msgspec
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from terrafix.core.config import Config, load
 from terrafix.core.errors import MapError, ModelError, UsageError
+from terrafix.core.flight_id import recorded_flight_id
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import start_is_unknown, with_map_center
 from terrafix.core.node import Node, NodeContext
 from terrafix.core.passwords import without_password
 from terrafix.map.package import MapPackage
-from terrafix.messages import Message, Origin, SourceEnded
+from terrafix.messages import Message, Origin, SourceEnded, SourceFacts
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import header, versions
 from terrafix.vision.sources import Source, open_configured
@@ -36,6 +37,7 @@ from terrafix_tools.in_process import InProcessShell
 from terrafix_tools.likely_cause import UNMEASURED
 from terrafix_tools.live import swapped_hint
 from terrafix_tools.map_probe import likely_factor
+from terrafix_tools.progress import LineProgress
 from terrafix_tools.replay_output import ReplayOutput
 from terrafix_tools.rerun.frames import RecordedFrames
 from terrafix_tools.source.text import fact_lines
@@ -64,6 +66,7 @@ def replay(
     configs: list[Path] | None = None,
     progress: bool = False,
     start: tuple[float, float] | None = None,
+    topics: Mapping[str, str] | None = None,
     nodes: MakeNodes = make_nodes,
     wrap_source: MakeSource = lambda source: source,
     watch: Watch = lambda messages: None,
@@ -71,6 +74,7 @@ def replay(
     """Writes estimates.csv, flight.mcap and summary.json into ``out`` and returns the summary.
 
     ``flight``: a source, or its name. ``models``: NAME=PATH. ``start``: (lat_deg, lon_deg), overrides the source's.
+    ``topics``: of a bag, by kind.
     ``nodes`` and ``wrap_source`` wrap the nodes and the source (to measure time, to inject faults). ``watch`` gets the
     messages of the origin, of each frame and of the end, when they are on disk. Raises subclasses of TerrafixError.
     """
@@ -81,20 +85,25 @@ def replay(
         if is_live(name) and not Path(flight).exists():
             shown = without_password(name)
             raise UsageError(f"{shown}: a live camera cannot be replayed; fly it with 'terrafix run --source {shown}'")
-        flight = open_configured(config.source, str(flight), start)
+        flight = open_configured(config.source, str(flight), start, topics)
     opened, source = flight, wrap_source(flight)
     package = package_of(_map_of(map_path, config, source), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
+    if not origin.flight_id:
+        first = next(opened.shots(), None)
+        flight_id = recorded_flight_id(origin, None if first is None else first.image)
+        origin = msgspec.structs.replace(origin, flight_id=flight_id)
     facts = facts_of(opened)
     if progress:
         for line in fact_lines(source.name(), facts):
             Console(stderr=True).print(line, markup=False, highlight=False, soft_wrap=True)
-    with ReplayOutput(out, header(config, package.resolve(), facts), config.recorder) as output:
+    with ReplayOutput(out, header(config, package.resolve()), config.recorder) as output:
         frames = MemoryFrameStore(FRAMES_KEPT)
         ctx = NodeContext(config=config, frames=frames, map_path=package.resolve(), out_dir=out.resolve())
         published: list[Message] = []
         shell = InProcessShell(nodes(ctx), lambda _who, message: published.append(message))
-        _feed_flight(source, origin, shell, frames, published, output, watch, progress)
+        said = SourceFacts(t_ns=origin.t_ns, facts=tuple(facts))
+        _feed_flight(source, origin, said, shell, frames, published, output, watch, progress)
         counts = output.counts()
         if UNMEASURED in counts["verdict"]["cause"] and not isinstance(opened, RecordedFrames):
             counts = output.counts(likely_factor(opened.shots(), origin, package))
@@ -131,6 +140,7 @@ def peak_memory_mb() -> float:
 def _feed_flight(
     source: Source,
     origin: Origin,
+    said: SourceFacts,
     shell: InProcessShell,
     frames: MemoryFrameStore,
     published: list[Message],
@@ -140,6 +150,7 @@ def _feed_flight(
 ) -> None:
     """Feeds the frames one after the other. Recording is outside the measured time: in flight it is another process."""
     shell.feed(origin)
+    shell.feed(said)
     output.take(published)
     watch(published)
     published.clear()
@@ -256,7 +267,7 @@ def _not_covered(origin: Origin, bounds_m: tuple[float, float, float, float]) ->
 @contextmanager
 def _bar(shown: bool, total: int | None) -> Iterator[Callable[[], None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
+    with LineProgress(*columns, console=Console(stderr=True), shown=shown) as progress:
         task = progress.add_task("replay", total=total)
         yield lambda: progress.advance(task)
 

@@ -21,6 +21,7 @@ from terrafix.anchor.frame_pose import (
 )
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, View, view_at
+from terrafix.anchor.matching.layer_selector import POOR_SCORE
 from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
 from terrafix.anchor.matching.match_message import pose_match
 from terrafix.anchor.matching.point_mass_filter import MAX_HALF_CELLS, Belief, Mode, belief_cell_m
@@ -47,9 +48,9 @@ from terrafix.anchor.relocalization.relocalizer import (
 from terrafix.anchor.verification.converged_place import PlaceTest
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
 from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
-from terrafix.core.camera import CameraCalibration
+from terrafix.core.camera import CameraCalibration, Readout
 from terrafix.core.gate import SIGMAS_95
-from terrafix.core.geodesy import LocalFrame
+from terrafix.core.geodesy import LocalFrame, rot_from_quat
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.node import Image
@@ -80,8 +81,6 @@ START_SIGMA_FLOOR_M = 8.0
 # taken, and a change of the tilt error by one degree between frames moves it. A tilt that is known better contributes
 # less. It is added per frame, and a slow copter at two frames a second observes little new ground to remove it. [tuned]
 TILT_JITTER = 0.02
-# Standardised correlation at the mode that counts as poor; a frame at the right place has 3 to 10. [tuned]
-POOR_SCORE = 2.0
 MAX_POOR_WEIGHT = 4.0  # consecutive full observations below it before the window is widened [tuned]
 WIDEN_FACTOR = 1.6  # of the window's half width [tuned]
 CELL_RATIO_MIN, CELL_RATIO_MAX = 0.4, 2.5  # hysteresis of a belief cell's octave [tuned]
@@ -192,7 +191,9 @@ class Localizer:
         """Moves belief and search by odometry. The first prediction of a flight initialises the belief."""
         if self._layers is None or self._origin is None:
             return
-        self._layers.set_distortion(prediction.radial_k1)
+        r_w_c = rot_from_quat(prediction.q_w_c)
+        readout = Readout.of(self._origin.camera, prediction.readout_motion, r_w_c)
+        self._layers.set_lens(prediction.radial_k1, readout)
         best = self._layers.best
         cell_m = belief_cell_m(prediction.agl_m, best.matcher.correlation_cell_m(prediction.agl_m))
         step_m = float(np.hypot(*prediction.step_m))

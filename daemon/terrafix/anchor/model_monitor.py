@@ -6,7 +6,7 @@ from terrafix.messages import ModelChange, ModelEvent
 from terrafix_engines.features.xfeat import XFeatDescriber
 from terrafix_engines.providers import short_name
 
-MAX_FAILURES = 5  # consecutive frames without a result after which the model is disabled for this flight [tuned]
+MAX_MODEL_FAILURES = 5  # consecutive frames without a result after which the model is disabled for this flight [tuned]
 
 
 class ModelMonitor:
@@ -39,8 +39,8 @@ class ModelMonitor:
         return self._provider_events(t_ns)
 
     def failed(self, t_ns: int, reason: str) -> list[ModelEvent]:
-        """After a frame on which the model failed; ``given_up`` is true from the ``MAX_FAILURES``-th consecutive one
-        on."""
+        """After a frame on which the model failed; ``given_up`` is true from the ``MAX_MODEL_FAILURES``-th consecutive
+        one on."""
         self._failures += 1
         self._results = self._model.run_count if self._model is not None else 0
         events = [*self._provider_events(t_ns), self.event(t_ns, ModelChange.FAILED, reason)]
@@ -60,7 +60,7 @@ class ModelMonitor:
 
     @property
     def given_up(self) -> bool:
-        return self._failures >= MAX_FAILURES
+        return self._failures >= MAX_MODEL_FAILURES
 
     def _provider_events(self, t_ns: int) -> list[ModelEvent]:
         if self._model is None or len(self._model.rejected_providers) == self._reported:

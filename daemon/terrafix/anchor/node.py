@@ -117,10 +117,7 @@ class AnchorNode:
             self._published_step = match.search.step
             joined = prediction.joined or match.search.step is SearchStep.MERGE
             yield SearchState(
-                t_ns=prediction.t_ns,
-                step=match.search.step,
-                fragment_id=prediction.fragment_id,
-                joined=joined,
+                t_ns=prediction.t_ns, step=match.search.step, fragment_id=prediction.fragment_id, joined=joined
             )
 
     def _search_places(self, prediction: Prediction) -> Iterable[Message]:

@@ -3,6 +3,7 @@
 import time
 
 NS_PER_S, NS_PER_MS = 1_000_000_000, 1_000_000
+MAX_CLOCK_DRIFT = 200e-6  # s/s between two computers; crystals are within 50 ppm, a larger fitted drift is noise
 
 
 def now_ns() -> int:

@@ -1,4 +1,4 @@
-"""Serialisation of messages: msgpack between processes, JSON for records and logs.
+"""Serialisation of messages between processes: msgpack.
 
 No pickle, because unpickling bytes from outside can execute code."""
 
@@ -20,8 +20,6 @@ def _numpy_to_python(value: Any) -> Any:
 
 _msgpack_encoder = msgspec.msgpack.Encoder(enc_hook=_numpy_to_python)
 _msgpack_decoder = msgspec.msgpack.Decoder(AnyMessage)
-_json_encoder = msgspec.json.Encoder(enc_hook=_numpy_to_python)
-_json_decoder = msgspec.json.Decoder(AnyMessage)
 
 
 def encode(message: Message) -> bytes:
@@ -31,11 +29,3 @@ def encode(message: Message) -> bytes:
 def decode(data: bytes | memoryview) -> Message:
     """Raises msgspec.ValidationError or DecodeError when ``data`` is not a message of messages.py."""
     return _msgpack_decoder.decode(data)
-
-
-def encode_json(message: Message) -> bytes:
-    return _json_encoder.encode(message)
-
-
-def decode_json(data: bytes | str) -> Message:
-    return _json_decoder.decode(data)

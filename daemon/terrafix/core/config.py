@@ -98,6 +98,7 @@ class SourceSection(Section, frozen=True, kw_only=True):
     start: str = ""  # "LAT,LON" in degrees, overrides the source; the command line overrides it
     camera: str = ""  # camera description (config/cameras); required for cameras, optional for photos and videos
     rate_hz: Annotated[float, Meta(gt=0, le=120)] = 2.0  # frames per second taken from a video or a camera
+    topics: dict[str, str] = {}  # of a ROS bag, by kind (vision/sources/bag_topics.py)
     latency_ms: Annotated[float, Meta(ge=0, le=2000)] = 0.0  # of a camera, from exposure to time stamp
     latency_sigma_ms: Annotated[float, Meta(ge=0, le=2000)] = 0.0  # its 1-sigma; 0: as usual for the kind of camera
     sender_clock: bool = False  # the clock of an RTSP camera is synchronised: its sender reports give the exposure

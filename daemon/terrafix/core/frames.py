@@ -26,7 +26,7 @@ MAGIC = 0x31465852_52455431  # layout version 1
 BUDGET_BYTES = 192 * 2**20  # a tenth of the memory of a computer with 2 GB; 20 full-HD frames are 118 MiB
 MAX_SLOTS = 20  # a consumer that lags by more frames than this gives no useful result: 2 s at 10 Hz
 MIN_SLOTS = 4  # frames of 26 megapixels (78 MB each) exceed the budget, but arrive at a low rate
-CHANNELS = 3  # BGR
+IMAGE_CHANNELS = 3  # BGR
 _PAGE = 4096
 _SLOT_HEADER_WORDS = 8
 _MAGIC, _SLOTS, _SLOT_BYTES = range(3)  # words of the file header
@@ -78,7 +78,7 @@ class SharedFrameStore:
         """``image``: (H, W, 3) uint8 BGR. Raises OutputError when shared memory is too small for the ring."""
         if not self._writer:
             raise ValueError("this store was opened for reading")
-        if image.dtype != np.uint8 or image.ndim != CHANNELS or image.shape[2] != CHANNELS:
+        if image.dtype != np.uint8 or image.ndim != IMAGE_CHANNELS or image.shape[2] != IMAGE_CHANNELS:
             raise ValueError(f"a frame is (H, W, 3) uint8, not {image.shape} {image.dtype}")
         self._writable(image.nbytes).put(frame_id, image)
 
@@ -181,8 +181,8 @@ class _Ring:
         self._fence()
         if generation % 2 or int(header[_FRAME]) != frame_id + 1:
             return None
-        shape = (int(header[_HEIGHT]), int(header[_WIDTH]), CHANNELS)
-        size = shape[0] * shape[1] * CHANNELS
+        shape = (int(header[_HEIGHT]), int(header[_WIDTH]), IMAGE_CHANNELS)
+        size = shape[0] * shape[1] * IMAGE_CHANNELS
         if size > self.slot_bytes:
             return None  # the header is being overwritten
         image = self._pixels[slot, :size].reshape(shape).copy()

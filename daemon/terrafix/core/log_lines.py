@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from terrafix.messages import (
+    FIX_3D,
     OVERTAKEN,
     CalibrationFault,
     Dropped,
@@ -43,7 +44,6 @@ from terrafix.messages import (
 
 WARNING_SEVERITY = 4  # MAV_SEVERITY_WARNING; lower numbers are more severe
 DEBUG_SEVERITY = 7  # MAV_SEVERITY_DEBUG
-FIX_3D = 3  # GPS_FIX_TYPE
 # Tracking without and with information from a frame: these two alternate where images are bad.
 TRACKING_STEPS = (SearchStep.NORMAL, SearchStep.SKIP)
 SEARCHING_STEPS = (SearchStep.WIDEN, SearchStep.WHOLE_MAP, SearchStep.ASK)

@@ -28,13 +28,13 @@ if _HIDDEN not in sys.modules:
 else:
     import structlog
 
-QUEUE_LENGTH = 2000  # lines; when the reader of stdout hangs, lines are lost instead of the process blocking
-FLUSH_S = 1.0  # time limit for writing the queued lines at exit
-BURST = 10  # lines of one event within BURST_NS; more are counted. All processes start with one line each
+LOG_QUEUE_LENGTH = 2000  # lines; when the reader of stdout hangs, lines are lost instead of the process blocking
+EXIT_FLUSH_S = 1.0  # time limit for writing the queued lines at exit
+EVENT_BURST = 10  # lines of one event within BURST_NS; more are counted. All processes start with one line each
 BURST_NS = 10 * NS_PER_S
 KEPT_LINES = 200  # that wait for the record
 FROM_MESSAGE = "_from_message"  # field of lines whose message is in the record
-LEVELS = {"DEBUG": logging.DEBUG, "INFO": logging.INFO, "WARN": logging.WARNING, "ERROR": logging.ERROR}
+LOG_LEVELS = {"DEBUG": logging.DEBUG, "INFO": logging.INFO, "WARN": logging.WARNING, "ERROR": logging.ERROR}
 
 
 class LineStream(Protocol):
@@ -49,7 +49,7 @@ class LineWriter:
 
     def __init__(self, stream: LineStream) -> None:
         self._stream = stream
-        self._queue: queue.Queue[str | None] = queue.Queue(QUEUE_LENGTH)
+        self._queue: queue.Queue[str | None] = queue.Queue(LOG_QUEUE_LENGTH)
         self._lost = 0
         self._thread = threading.Thread(target=self._write_all, name="log-writer", daemon=True)
         self._thread.start()
@@ -63,10 +63,10 @@ class LineWriter:
     def close(self) -> None:
         atexit.unregister(self.close)
         try:
-            self._queue.put(None, timeout=FLUSH_S)
+            self._queue.put(None, timeout=EXIT_FLUSH_S)
         except queue.Full:
             return
-        self._thread.join(FLUSH_S)
+        self._thread.join(EXIT_FLUSH_S)
 
     def _write_all(self) -> None:
         while (line := self._queue.get()) is not None:
@@ -95,7 +95,7 @@ def _monotonic(_logger: Any, _method: str, event: structlog.typing.EventDict) ->
 
 
 class RateLimit:
-    """At most BURST lines of one event within BURST_NS. The next line after that says how many were left out
+    """At most EVENT_BURST lines of one event within BURST_NS. The next line after that says how many were left out
     (``suppressed``), so that a fault that repeats at the rate of frames fills neither the journal nor the record."""
 
     def __init__(self, clock: Callable[[], int] = now_ns) -> None:
@@ -106,8 +106,8 @@ class RateLimit:
 
     def __call__(self, _logger: Any, method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
         name, now = str(event["event"]), self._clock()
-        times = self._times.setdefault(name, deque(maxlen=BURST))
-        if len(times) == BURST and now - times[0] < BURST_NS:
+        times = self._times.setdefault(name, deque(maxlen=EVENT_BURST))
+        if len(times) == EVENT_BURST and now - times[0] < BURST_NS:
             self._suppressed[name] = self._suppressed.get(name, 0) + 1
             if not event.get(FROM_MESSAGE):
                 self._levels[name] = method
@@ -176,7 +176,7 @@ def configure(level: str, process: str, stream: LineStream | None = None) -> Lin
             _with_process(process),
             structlog.processors.JSONRenderer(),
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(min(LEVELS[level], logging.WARNING)),
+        wrapper_class=structlog.make_filtering_bound_logger(min(LOG_LEVELS[level], logging.WARNING)),
         logger_factory=lambda *_: _Logger(writer),
         cache_logger_on_first_use=False,
     )
@@ -186,7 +186,7 @@ def configure(level: str, process: str, stream: LineStream | None = None) -> Lin
 
 def _from_level(level: str) -> structlog.typing.Processor:
     def drop(_logger: Any, method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
-        if logging.getLevelNamesMapping()[method.upper()] < LEVELS[level]:
+        if logging.getLevelNamesMapping()[method.upper()] < LOG_LEVELS[level]:
             raise structlog.DropEvent
         return event
 

@@ -40,11 +40,9 @@ class NodeContext:
 class Node(Protocol):
     def on(self, message: Message) -> Iterable[Message]:
         """Processes one message; returns the resulting messages."""
-        ...
 
     def tick(self, now_ns: int) -> Iterable[Message]:
         """Called at the tick rate of the process table; ``now_ns`` is the monotonic time of the shell."""
-        ...
 
 
 class Edge(Protocol):
@@ -57,6 +55,5 @@ class Edge(Protocol):
 
     def on_message(self, message: Message) -> None:
         """Called with every message that the process receives and every message that its node publishes."""
-        ...
 
     def close(self) -> None: ...

@@ -19,15 +19,15 @@ CONFIDENCE = 0.999  # RANSAC confidence [tuned]
 INLIER_THRESHOLD = 0.03
 # of that threshold, where a match counts nothing: 4.7 of the sigmas that patches have, so that the estimate is as
 # precise as least squares to 5 % [spec: biweight, 95 % efficiency]
-CUTOFF = 1.25
+POSE_CUTOFF = 1.25
 SEARCH_RADIUS = 0.08  # search radius of a patch around its expected place, share of the height [tuned]
 PNP_MIN_INLIERS = 8  # fewest inliers of a pose [tuned]
 MIN_INLIER_SHARE = 0.35  # smallest share of inliers [tuned]
 # Effective share of independent patches. Neighbours share a third of their error, patches farther apart nothing; with
 # four neighbours 1 in 1 + 4/3 is independent. [measured: docs/monte-carlo.md]
-INDEPENDENT_SHARE = 3 / 7
+INDEPENDENT_MATCH_SHARE = 3 / 7
 # largest angle between pose and prediction; the mirrored solution of a planar scene exceeds it [tuned]
-MAX_TILT_CHANGE_RAD = np.radians(20.0)
+MAX_POSE_TILT_CHANGE_RAD = np.radians(20.0)
 PLANAR_RELIEF = 0.02  # share of the height: ground with less relief is treated as a plane [tuned]
 
 
@@ -50,7 +50,7 @@ def solve(points_w_m: np.ndarray, xy: np.ndarray, weights: np.ndarray, given: Pn
 
     Required inliers: the largest of ``given.min_inliers``, ``MIN_INLIER_SHARE`` of N, and N p + 4 sqrt(N p) + 3, where
     p is the probability that a randomly matched patch is an inlier. With fewer the verdict is FEW_INLIERS; DEGENERATE
-    if the refinement fails, the tilt is more than ``MAX_TILT_CHANGE_RAD`` from the prediction, or a number is not
+    if the refinement fails, the tilt is more than ``MAX_POSE_TILT_CHANGE_RAD`` from the prediction, or a number is not
     finite; both without a pose. Else ACCEPTED.
     """
     n, none = len(xy), np.zeros(len(xy), bool)
@@ -69,7 +69,7 @@ def solve(points_w_m: np.ndarray, xy: np.ndarray, weights: np.ndarray, given: Pn
     if fit is None or inlier.sum() < needed:
         return PnpResult(Verdict.FEW_INLIERS if fit else Verdict.DEGENERATE, None, inlier)
     tilt = np.asarray(log_so3(rot_from_quat(given.q_w_c).T @ fit.r_w_c))[:2]
-    if float(np.linalg.norm(tilt)) > MAX_TILT_CHANGE_RAD:
+    if float(np.linalg.norm(tilt)) > MAX_POSE_TILT_CHANGE_RAD:
         return PnpResult(Verdict.DEGENERATE, None, inlier)
     cov = fit.cov * outlier_inflation(n, int(inlier.sum()), p_random_inlier)
     return PnpResult(Verdict.ACCEPTED, replace(fit, cov=cov), inlier)
@@ -177,20 +177,13 @@ def _refine(
         start.p_c_in_w_m,
         given.sigma_floor,
         weights[inlier],
-        INDEPENDENT_SHARE,
+        INDEPENDENT_MATCH_SHARE,
     )
     if first is None:
         return None, inlier
-    cutoff = CUTOFF * given.threshold
+    cutoff = POSE_CUTOFF * given.threshold
     fit = fit_pose(
-        points,
-        xy,
-        first.r_w_c,
-        first.p_c_in_w_m,
-        given.sigma_floor,
-        weights,
-        INDEPENDENT_SHARE,
-        cutoff=cutoff,
+        points, xy, first.r_w_c, first.p_c_in_w_m, given.sigma_floor, weights, INDEPENDENT_MATCH_SHARE, cutoff=cutoff
     )
     if fit is None:
         return None, inlier

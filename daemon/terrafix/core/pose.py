@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)  # of a tangent vector [spec: Pose3 tangent order]
-HUBER_K = 1.345  # threshold in sigmas: 95 % efficiency on Gaussian noise (Huber 1981)
+HORIZONTAL = slice(0, 2)  # of a vector in the world [spec: east, north, up]
+POSE_HUBER_K = 1.345  # threshold in sigmas: 95 % efficiency on Gaussian noise (Huber 1981)
 MAX_ITERATIONS, MAX_CUT_ITERATIONS = 15, 40  # the second with a cutoff, whose weights change with the pose
 MAX_CONDITION = 1e9  # condition number of the scaled normal equations; a well-conditioned geometry has less than ten
-STEP_TOLERANCE = 1e-5  # last step [rad, and metres relative to depth]: a hundredth of a pixel, below the noise
+POSE_STEP_TOLERANCE = 1e-5  # last step [rad, and metres relative to depth]: a hundredth of a pixel, below the noise
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def fit_pose(
     weights: np.ndarray | None = None,
     independent_share: float = 1.0,
     tilt_sigma_rad: float | None = None,
-    tolerance: float = STEP_TOLERANCE,
+    tolerance: float = POSE_STEP_TOLERANCE,
     cutoff: float | None = None,
 ) -> PoseFit | None:
     """Robust least squares on the reprojection error of points (N, 3) observed at normalised ``xy`` (N, 2).
@@ -105,7 +106,7 @@ def fit_pose(
         if agrees is not None and weights is not None:
             agrees *= weights
         sigma = max(sigma_floor, _spread(norm, agrees))
-        w = np.minimum(1.0, HUBER_K * sigma / np.maximum(norm, 1e-12))
+        w = np.minimum(1.0, POSE_HUBER_K * sigma / np.maximum(norm, 1e-12))
         if agrees is not None:
             w *= agrees
         elif weights is not None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from terrafix.core.errors import ConfigError, OutputError, UsageError
 
 PUBLIC_PREFIX = "terrafix-ed25519 "  # a public key file is one line: this prefix, the key in base64, the owner
-KEY_BYTES = 32
+ED25519_KEY_BYTES = 32
 ID_DIGITS = 16  # hexadecimal
 
 
@@ -98,7 +98,7 @@ def read_public(path: Path) -> TrustedKey:
         raw = base64.b64decode(words[1], validate=True) if text.startswith(PUBLIC_PREFIX) and len(words) > 1 else b""
     except binascii.Error:
         raw = b""
-    if len(raw) != KEY_BYTES:
+    if len(raw) != ED25519_KEY_BYTES:
         raise ConfigError(f"{path}: not a public key of 'terrafix map keygen'; give its .pub file")
     return TrustedKey(raw)
 

@@ -13,7 +13,12 @@ from gtsam.symbol_shorthand import B, V
 
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.graph.pose_graph import GraphPrior, NewNode, PoseGraph, rebuild_prior
-from terrafix.estimator.graph.propagated_covariance import CALIBRATION, MOTION, POSE, PropagatedCovariance
+from terrafix.estimator.graph.propagated_covariance import (
+    CALIBRATION_BLOCK,
+    MOTION_BLOCK,
+    POSE_BLOCK,
+    PropagatedCovariance,
+)
 from terrafix.estimator.state import CALIBRATION_SIZE, HORIZONTAL, NodeState
 from terrafix.messages import CovarianceMode
 
@@ -57,7 +62,7 @@ class Covariances:
     def pose(self, node: int) -> np.ndarray:
         """(6, 6) of C, tangent order."""
         if self._propagated is not None:
-            return self._propagated[node][POSE, POSE].copy()
+            return self._propagated[node][POSE_BLOCK, POSE_BLOCK].copy()
         return self._graph.covariance(node)
 
     def record(self, node: int) -> None:
@@ -77,13 +82,13 @@ class Covariances:
     def motion(self, node: int) -> np.ndarray:
         """(8, 8) of V."""
         if self._propagated is not None:
-            return self._propagated[node][MOTION, MOTION].copy()
+            return self._propagated[node][MOTION_BLOCK, MOTION_BLOCK].copy()
         return self._graph.motion_covariance(node)
 
     def calibration(self, node: int) -> np.ndarray:
         """(6, 6) of B."""
         if self._propagated is not None:
-            return self._propagated[node][CALIBRATION, CALIBRATION].copy()
+            return self._propagated[node][CALIBRATION_BLOCK, CALIBRATION_BLOCK].copy()
         return self._graph.calibration_covariance(node)
 
     def started(self, node: int, prior: GraphPrior) -> None:

@@ -14,6 +14,7 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.covariances import Covariances
 from terrafix.estimator.graph.pose_graph import PoseGraph
 from terrafix.estimator.integrity.fragments import Fragment, Fragments
+from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.yaw_gauge import YawGauge
 from terrafix.estimator.keyframe_store import KeptKeyframe, KeyframeStore
 from terrafix.estimator.keyframe_substitution import KeyframeSubstitution
@@ -126,8 +127,8 @@ class FilterState:
         self.has_height = False
         self.began_s = 0.0
         self.newest_odometry: Odometry | None = None  # as vision published it
-        # Time of the newest implausible odometry, and (2,) by which it was off the prediction, east and north.
-        self.image_jump: tuple[float, np.ndarray] | None = None  # None: none since a match
+        # Time of the newest implausible odometry, and by which it was off the prediction, east and north.
+        self.image_jump: tuple[float, Innovation] | None = None  # None: none since a match
         # Images have contradicted inertial readings for so long that one of the two is wrong, and no place has decided.
         self.images_contradicted = False
         self.orientation = OrientationMonitor()

@@ -14,11 +14,7 @@ from terrafix.estimator.graph.pose_graph import GraphPrior
 from terrafix.estimator.integrity.fragments import Fragment
 from terrafix.estimator.integrity.yaw_gauge import YawGauge
 from terrafix.estimator.keyframe_substitution import KeyframeSubstitution
-from terrafix.estimator.measurements.attitude_height import (
-    DEFAULT_AGL_M,
-    DEFAULT_AGL_SIGMA_M,
-    UNKNOWN_RAD,
-)
+from terrafix.estimator.measurements.attitude_height import DEFAULT_AGL_M, DEFAULT_AGL_SIGMA_M, UNKNOWN_RAD
 from terrafix.estimator.measurements.telemetry_buffer import UNKNOWN_ATTITUDE_RAD, Attitude
 from terrafix.estimator.models.bias_walk import walk_sigmas
 from terrafix.estimator.models.lens_prior import radial_k1_sigma
@@ -95,11 +91,7 @@ def reset(
 
 
 def start_at(
-    state: FilterState,
-    frame: FrameInput,
-    at_m: np.ndarray,
-    sigma_m: float,
-    calibration: CalibrationState | None = None,
+    state: FilterState, frame: FrameInput, at_m: np.ndarray, sigma_m: float, calibration: CalibrationState | None = None
 ) -> FrameState:
     """A new graph at ``at_m`` (2,), east and north, known to ``sigma_m``: attitude and height as the autopilot reports
     them, nothing known of the velocity. ``calibration``: as estimated before; None: the prior of the description."""

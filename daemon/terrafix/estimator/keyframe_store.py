@@ -14,15 +14,10 @@ from terrafix.estimator.state import POSE_SIZE
 
 # Keyframes, the oldest of which are dropped first: at one a second, which is the most that vision keeps, almost three
 # hours of flight, in 4 MB that are reserved at the start. [spec: vision keeps at most one keyframe a second]
-MAX_KEYFRAMES = 10_000
+MAX_STORED_KEYFRAMES = 10_000
 
 _ROW = np.dtype(
-    [
-        ("rotation", float, (3, 3)),
-        ("p_m", float, (3,)),
-        ("cov", float, (POSE_SIZE, POSE_SIZE)),
-        ("ground_m", float),
-    ]
+    [("rotation", float, (3, 3)), ("p_m", float, (3,)), ("cov", float, (POSE_SIZE, POSE_SIZE)), ("ground_m", float)]
 )
 
 
@@ -40,7 +35,7 @@ class KeyframeStore:
     They lie in arrays that are written once at the start: objects of their own would take twice the memory, and would
     keep the heap around them from being used again. ``max_keyframes``: the oldest are dropped."""
 
-    def __init__(self, max_keyframes: int = MAX_KEYFRAMES) -> None:
+    def __init__(self, max_keyframes: int = MAX_STORED_KEYFRAMES) -> None:
         self._rows = np.zeros(max_keyframes, _ROW)
         self._rows["rotation"] = 0.0  # written, so that the kernel gives all of the memory now
         self._fragments: list[Fragment | None] = [None] * max_keyframes

@@ -51,11 +51,13 @@ NOTHING_FOUND = (Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE)
 @dataclass(frozen=True)
 class MapResult:
     """What was done with a map match: ``fusion``, the verdict on it, and ``others``: on a start coordinate that the map
-    contradicts, and on a reset of the graph. ``fixed``: of an accepted match, for the smoother."""
+    contradicts, and on a reset of the graph. ``fixed``: of an accepted match, for the smoother. ``off``: (2,) of a pose
+    that the gate has rejected, from the estimate of its frame."""
 
     fusion: FusionVerdict
     others: tuple[FusionVerdict, ...] = ()
     fixed: FixedPose | None = None
+    off: Innovation | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -220,7 +222,7 @@ class MapUpdate:
         here_m, coarse = predicted.translation()[:2], match.position_only
         jump = state.image_jump
         if not run.offsets_m and jump is not None and 0.0 <= t_s - jump[0] < MOTION_TIMEOUT_S:  # the images say so too
-            run.add(jump[1], here_m, position_only=coarse, t_s=jump[0], cov_m2=claim_m2)
+            run.add(jump[1].residual, here_m, position_only=coarse, t_s=jump[0], cov_m2=claim_m2)
         agrees = run.add(offset, here_m, position_only=coarse, t_s=t_s, cov_m2=claim_m2)
         if not match.position_only and not agrees:  # those that agree with each other support another position
             self.hypotheses.other_ground.on_rejected(offset)
@@ -239,7 +241,8 @@ class MapUpdate:
                 other.switch(offset, apart)
                 return self._reset(match, self._past(node), measurement, "restarted")
         detail = f"horizontally {float(np.hypot(*offset)):.0f} m from the estimate"
-        return MapResult(FusionVerdict(measurement.name, Verdict.INNOVATION, innovation, detail))
+        off = None if coarse else position
+        return MapResult(FusionVerdict(measurement.name, Verdict.INNOVATION, innovation, detail), off=off)
 
     def _past(self, node: int) -> PastFrame:
         graph = self._state.graph

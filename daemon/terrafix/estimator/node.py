@@ -5,26 +5,30 @@ from collections.abc import Callable, Iterable
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
+from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.node import Edge, NodeContext
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.claim import Claim
 from terrafix.estimator.edge import EstimatorEdge
 from terrafix.estimator.estimator import Estimator
-from terrafix.estimator.filter_state import FrameInput, FrameState
+from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState
 from terrafix.estimator.initialization import ResetReason
 from terrafix.estimator.integrity.camera_vehicle import CameraVehicleTest
-from terrafix.estimator.integrity.innovation import FusionVerdict
-from terrafix.estimator.integrity.time_offset import TimeOffset
+from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
+from terrafix.estimator.integrity.offset_drift import STEP_S
+from terrafix.estimator.integrity.time_offset import Contradiction, TimeOffset
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
 from terrafix.estimator.measurements.odometry import NO_NEW_VIEW, without_ground
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
+from terrafix.estimator.monitors.refused_pictures import RefusedPictures
 from terrafix.estimator.output import (
     calibration_of,
     estimate_of,
@@ -41,6 +45,7 @@ from terrafix.estimator.pose_estimator import (
 )
 from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpoint
 from terrafix.estimator.propagation import PropagationResult
+from terrafix.estimator.rolling_shutter import RollingShutter
 from terrafix.estimator.smoother_inputs import map_anchor, odometry_link, relocalization_link
 from terrafix.messages import (
     CalibrationFault,
@@ -105,6 +110,7 @@ class EstimatorNode:
         sent_ns = None if checkpoint is None else checkpoint.estimate.t_ns
         self._ahrs = AhrsCorrectionMonitor(self._telemetry, sent_ns)
         self._attitude: Attitude | None = None  # at the newest frame
+        self._shutter: RollingShutter | None = None  # of the camera of the Origin
         self._early_dead_reckoning: list[
             EkfDeadReckoning
         ] = []  # before the Origin: the link may run before vision does
@@ -120,6 +126,7 @@ class EstimatorNode:
         self._relocated = False  # a relocalisation has moved the estimate since
         self._monitors: Monitors | None = None
         self._rebuilds = 0  # of the graph
+        self._refused = RefusedPictures()
         self._start_moved = False  # as reported
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
             Origin: self._on_origin,
@@ -176,7 +183,7 @@ class EstimatorNode:
         self._telemetry.gimbal.describe(origin.camera)
         self._predicted_id = None  # in other axes
         prior = self._prior(origin, self._axes)
-        offset = TimeOffset(Mount.of(origin.camera).r_b_c())
+        offset, self._shutter = TimeOffset(Mount.of(origin.camera).r_b_c()), RollingShutter(origin.camera)
         self._begin(self._make_estimator(with_initial_position(origin, self._initial), prior), offset)
         waiting, self._early_dead_reckoning = self._early_dead_reckoning, []
         for sample in waiting:
@@ -312,10 +319,14 @@ class EstimatorNode:
     def _frame(self, odometry: Odometry) -> Iterable[Message]:
         if self._estimator is None or self._flight is None:
             return
-        stamped, time_offset = odometry, self._flight.time_offset
+        stamped_ns, time_offset = odometry.t_ns, self._flight.time_offset
         if (camera_vehicle := self._camera_vehicle.on_odometry(odometry, self._estimator.origin.camera)) is not None:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
+        newest = self._estimator.last
+        if newest is not None and odometry.t_ns * 1e-9 < newest.t_s + STEP_S:  # by an offset that has jumped
+            yield odometry_verdict(odometry, Verdict.STALE, "taken before the newest frame")
+            return
         estimator, frame = self._frame_input(self._estimator, odometry)
         odometry = frame.odometry
         follows = not self._relocated and self._note_predicted_frame(estimator)
@@ -340,12 +351,18 @@ class EstimatorNode:
             self._monitors.on_odometry(odometry, self._telemetry, float(np.hypot(*result.step_m)), agl_m, orientation)
             yield from self._monitors.take_changes(odometry.t_ns)
             # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground anyhow.
-            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground
+            # Near the ground images move by more than their error, and on it the attitude wanders alone.
+            low = frame.attitude.stands or agl_m < MIN_MATCHING_AGL_M
+            untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground or low
+            jump = estimator.state.image_jump
             if estimator.state.orientation.suspects or untimed:
                 time_offset.forget_images()
             else:
-                time_offset.add(stamped, self._telemetry, agl_m)
+                if jump is not None and jump[0] == frame.t_s:
+                    self._time_contradicted(stamped_ns, jump[1], result.placed, by_map=False)
+                time_offset.add(msgspec.structs.replace(odometry, t_ns=stamped_ns), self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
+        yield from self._refused_pictures(odometry.t_ns, result.verdict, estimator.state, frame.attitude)
         yield from self._start_fault(estimator, odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:
@@ -355,6 +372,25 @@ class EstimatorNode:
             self._ahrs.position_published(estimate.t_ns, estimate.velocity_sigma_mps)
         yield estimate
         yield from odometry_link(estimator, result, odometry.t_ns)  # last: it delays nothing
+
+    def _time_contradicted(self, t_ns: int, off: Innovation, frame: FrameState, *, by_map: bool) -> None:
+        """``off``: a frame at the uncorrected ``t_ns`` the estimate; ``frame``: the newest one."""
+        assert self._flight is not None
+        agl_m = max(self._flight.estimator.terrain.height_above_m(frame.pose.translation()), 1.0)
+        seen = Contradiction(t_ns, off, frame.velocity_mps[:2], agl_m)
+        self._flight.time_offset.contradict(seen, self._telemetry, by_map=by_map)
+
+    def _refused_pictures(
+        self, t_ns: int, verdict: Verdict, state: FilterState, attitude: Attitude
+    ) -> Iterable[Message]:
+        """Faults of pictures that are refused for no reason that has a name already."""
+        assert self._flight is not None
+        if attitude.stands:  # a camera on the ground is out of focus
+            return ()
+        if verdict is Verdict.UNCONFIRMED and not state.continuity.last_increment_inertial:
+            return ()  # nothing says how the vehicle moves
+        named = state.orientation.fault is not None or self._flight.time_offset.is_wrong
+        return self._refused.add(t_ns, Verdict.ACCEPTED if named else verdict)
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved
@@ -385,6 +421,8 @@ class EstimatorNode:
         imu = self._ahrs.world_acceleration
         if not attitude.sees_ground:
             odometry = without_ground(odometry)
+        elif self._shutter is not None:
+            odometry = self._shutter.corrected(odometry, estimator.state, attitude, self._telemetry)
         estimator.state.on_gimbal = self._telemetry.gimbal.used
         return estimator, FrameInput(odometry.frame_id, odometry.t_ns * 1e-9, odometry, attitude, imu)
 
@@ -422,7 +460,8 @@ class EstimatorNode:
             step_m = np.asarray(frame.pose.translation()[:2]) - self._predicted_m
             step_var_m2 += max(float(np.linalg.eigvalsh(cov[:2, :2] - self._predicted_m2)[-1]), 0.0)
         prior_t_ns = 0 if self._initial is None else self._initial.t_ns
-        return prediction_of(estimator, frame, t_ns, step_m, step_var_m2, prior_t_ns)
+        motion = UNSET if self._shutter is None else self._shutter.motion
+        return prediction_of(estimator, frame, t_ns, step_m, step_var_m2, prior_t_ns, motion)
 
     def _is_slow_due(self, frame: FrameState, estimator: Estimator) -> bool:
         """Whether CalibrationEstimate and ClaimBudget are published with this frame: once a second, not before a map
@@ -451,7 +490,7 @@ class EstimatorNode:
             return
         if not self._relocated:
             self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
-        result = estimator.feed_relocalization(seen)
+        result = estimator.feed_relocalization(seen if self._shutter is None else self._shutter.relocalized(seen))
         fusion = result.fusion
         fragment = estimator.state.fragment_of(seen.frame_id)
         for verdict in (fusion, *self._rebuild_verdicts(estimator)):
@@ -481,6 +520,12 @@ class EstimatorNode:
         yield from (verdict_of(match.t_ns, match.frame_id, verdict, fragment) for verdict in verdicts)
         yield outcome.solution
         accepted = result.verdict is Verdict.ACCEPTED
+        if accepted:
+            flight.time_offset.agree()
+        elif result.off is not None and estimator.last is not None:
+            stamp_ns = match.t_ns + round(flight.time_offset.applied_s * 1e9)
+            self._time_contradicted(stamp_ns, result.off, estimator.last, by_map=True)
+            yield from flight.time_offset.take_changes(match.t_ns)
         if self._monitors is not None:
             yield from self._monitors.take_changes(match.t_ns)
         changed = accepted or was_multimodal or estimator.hypotheses.is_multimodal or result.verdict is Verdict.LOST

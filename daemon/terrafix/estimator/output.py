@@ -4,8 +4,9 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
+from terrafix.core.flight_id import frame_uid
 from terrafix.core.geodesy import LocalFrame, quat_from_rot
 from terrafix.core.map_error import shared_variance_m2
 from terrafix.core.pose import tangent_to_world
@@ -21,6 +22,7 @@ from terrafix.messages import (
     NavEstimate,
     Odometry,
     Prediction,
+    ReadoutMotion,
     RefinedPose,
     Refinement,
     SourceEnded,
@@ -67,7 +69,13 @@ def odometry_verdict(odometry: Odometry, verdict: Verdict, detail: str = "") -> 
 
 
 def prediction_of(
-    estimator: Estimator, frame: FrameState, t_ns: int, step_m: np.ndarray, step_var_m2: float, prior_t_ns: int
+    estimator: Estimator,
+    frame: FrameState,
+    t_ns: int,
+    step_m: np.ndarray,
+    step_var_m2: float,
+    prior_t_ns: int,
+    readout_motion: ReadoutMotion | UnsetType,
 ) -> Prediction:
     """``step_m`` (2,): of the camera since the frame of the Prediction before, with its variance on each axis."""
     r_w_c, p = frame.pose.rotation().matrix(), frame.pose.translation()
@@ -84,6 +92,7 @@ def prediction_of(
         step_cov_m2=(step_var_m2, 0.0, 0.0, step_var_m2),
         radial_k1=estimator.state.radial_k1(frame.node),
         prior_t_ns=max(prior_t_ns, round(estimator.dead_reckoned_s * 1e9)),
+        readout_motion=readout_motion,
         **_named(estimator.state.fragment_of(frame.frame_id)),
     )
 
@@ -119,6 +128,7 @@ def estimate_of(
         covariance_mode=state.mode,
         last_anchor_age_ms=age_ms,
         emitted_at_ns=max(t_ns, round(frame.t_s * 1e9)),  # the live executor sets the time of publishing here
+        frame_uid=frame_uid(state.origin.flight_id, frame.frame_id),
         **_named(fragment),
     )
 

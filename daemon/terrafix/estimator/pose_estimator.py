@@ -94,6 +94,7 @@ class PoseEstimate:
     """Pose of the frame of the match; of the newest frame, where the match has restarted the graph there."""
 
     frame_id: int
+    frame_uid: str  # unique over all flights: UUID of the flight and number of the frame
     position_wgs84: tuple[float, float, float]  # latitude, longitude [deg], height above mean sea level [m]
     orientation_world_T_body: tuple[float, float, float, float]
     covariance_6x6: np.ndarray  # (6, 6) position, then orientation; axes east, north, up; m^2 and rad^2
@@ -150,6 +151,7 @@ class OpenCVGtsamPoseEstimator:
         nav = estimate_of(flight.estimator, frame, flight.axes, flight.claim(frame), newest_ns, tracked=True)
         return PoseEstimate(
             frame_id=nav.frame_id,
+            frame_uid=nav.frame_uid,
             position_wgs84=(nav.lat_deg, nav.lon_deg, nav.alt_amsl_m),
             orientation_world_T_body=nav.q_w_b,
             covariance_6x6=np.array(nav.cov).reshape(6, 6),

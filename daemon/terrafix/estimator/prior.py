@@ -11,7 +11,7 @@ import numpy as np
 from terrafix.core.geodesy import LocalFrame, rot_from_quat, yaw_of
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.estimator.measurements.principal_point import graph_shift
-from terrafix.estimator.models.motion_model import MAX_SPEED_SIGMA_MPS, MIN_SPEED_MPS, integrate_motion
+from terrafix.estimator.models.motion_model import MAX_SPEED_SIGMA_MPS, MIN_MODEL_SPEED_MPS, integrate_motion
 from terrafix.estimator.models.speed_prior import TYPICAL_SPEED_MPS
 from terrafix.estimator.state import CALIBRATION_SIZE, HEADING
 from terrafix.messages import (
@@ -146,7 +146,7 @@ class NavPrior:
     def _turned(self, yaw_rad: float | None) -> float | None:
         """Turn of the course since ``t_s``, counter-clockwise [rad]. None: unknown, or course and heading differ."""
         east, north = self.velocity_mps
-        if yaw_rad is None or self.yaw_rad is None or np.hypot(east, north) < MIN_SPEED_MPS:
+        if yaw_rad is None or self.yaw_rad is None or np.hypot(east, north) < MIN_MODEL_SPEED_MPS:
             return None
         if np.cos(np.arctan2(east, north) - self.yaw_rad) < MIN_COURSE_COSINE:
             return None

@@ -19,11 +19,7 @@ from terrafix.estimator.measurements.aid_source import AidSample, AidSource
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning, DeadReckoningAid
 from terrafix.estimator.measurements.heading import heading_innovation
-from terrafix.estimator.measurements.height import (
-    height_innovation,
-    is_below_map_matching,
-    reported_agl_m,
-)
+from terrafix.estimator.measurements.height import height_innovation, is_below_map_matching, reported_agl_m
 from terrafix.estimator.measurements.keyframe_link import LinkMeasurement
 from terrafix.estimator.measurements.odometry import GatedOdometry, KeyframeMotion, OdometryMeasurement
 from terrafix.estimator.measurements.telemetry_buffer import Attitude

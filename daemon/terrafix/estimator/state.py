@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from terrafix.core.pose import HORIZONTAL as HORIZONTAL
 from terrafix.core.pose import ROTATION as ROTATION
 from terrafix.core.pose import TRANSLATION as TRANSLATION
 
 # Axes of the world, and of a position or a velocity in it. [spec: east, north, up]
 EAST, NORTH, UP = range(3)
-HORIZONTAL = slice(0, 2)  # [spec: east, north]
 
 POSE_SIZE = 6  # [spec: Pose3]
 # Pose covariance in world axes, as core.pose.tangent_to_world returns it.

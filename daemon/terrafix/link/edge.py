@@ -13,8 +13,9 @@ from terrafix.core import clock
 from terrafix.core.clock import NS_PER_S
 from terrafix.core.config import LinkSection
 from terrafix.core.mavlink.gimbal import GIMBAL_COMPONENTS
+from terrafix.core.mavlink.vehicles import AUTOPILOT_COMPONENT
 from terrafix.link.admission.packet_filter import Admission
-from terrafix.link.admission.served_autopilot import AUTOPILOT_COMPONENT, Role
+from terrafix.link.admission.served_autopilot import Role
 from terrafix.link.autopilot.autopilot_prior import AutopilotPrior
 from terrafix.link.autopilot.checkpoint import LinkCheckpointWriter
 from terrafix.link.autopilot.ekf_dead_reckoning import DeadReckoningRecorder

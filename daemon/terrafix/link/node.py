@@ -24,6 +24,7 @@ from terrafix.link.pilot_text.debounce import Debounce
 from terrafix.link.pilot_text.frame_load import FrameLoad
 from terrafix.link.pilot_text.statustext import CRITICAL, INFO, NOTICE, WARNING, fault_text, statustext
 from terrafix.messages import (
+    NO_FRAME_ID,
     CalibrationFault,
     EkfStatus,
     Frame,
@@ -48,7 +49,6 @@ from terrafix.messages import (
 )
 
 TICK_HZ = 50.0  # tick rate of the link process [spec: processes.py]
-NO_FRAME_ID = -1  # frame_id of a verdict that belongs to no frame [spec: MeasurementVerdict]
 
 
 def make_node(ctx: NodeContext) -> "LinkNode":
@@ -239,6 +239,7 @@ class LinkNode:
 
     def _on_ekf_status(self, status: EkfStatus) -> list[Message]:
         self._ekf_monitor.on_status(status)
+        self._gnss.on_ekf_status(status)
         return []
 
     def _on_search_state(self, state: SearchState) -> list[Message]:

@@ -7,12 +7,8 @@ import numpy as np
 from pyproj import Transformer
 
 from terrafix.map.format import TILE_PX, DescriptorTable, Layer, Level
+from terrafix.map.imagery import FIT_AFFINE, KNOTS
 from terrafix.map.tile_cache import TileStore
-
-# Knots (s, t, 1) over a window, and the pseudo-inverse that maps values at the knots to their least-squares affine map.
-# The affine error is below a tenth of a cell over a search block of 300 cells, in all usual map projections.
-KNOTS = np.array([(s, t, 1.0) for t in (0.0, 0.5, 1.0) for s in (0.0, 0.5, 1.0)])
-FIT_AFFINE = np.linalg.pinv(KNOTS)
 
 
 class StoredDescriptors:

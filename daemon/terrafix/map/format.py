@@ -23,9 +23,8 @@ TILE_PX = 256
 DEM_TILE_PX = 256
 CE90_SIGMAS = 2.1460  # CE90 of a circular normal error in units of its sigma: sqrt(-2 ln 0.1)
 DEM_NULL = 65535  # void in a 16-bit elevation tile
-SIGNATURE_PREFIX = (
-    b"terrafix map package\n"  # domain separation: prefix of the signed bytes, as the key may sign other data
-)
+# domain separation: prefix of the signed bytes, as the key may sign other data
+SIGNATURE_PREFIX = b"terrafix map package\n"
 
 HashRow = tuple[str, int, int, int, bytes]  # table, zoom, column, row, sha256
 

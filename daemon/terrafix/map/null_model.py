@@ -13,7 +13,7 @@ from typing import Self
 import msgspec
 import numpy as np
 
-VERSION = 1  # version of the score definition; a stored model of another version is not used
+SCORE_VERSION = 1  # version of the score definition; a stored model of another version is not used
 # Probability of a false detection over a whole flight, for a vehicle that is nowhere on the map: half for the search,
 # half for single-frame localization.
 FALSE_DETECTIONS_PER_FLIGHT = 1e-3
@@ -106,7 +106,7 @@ DEFAULT_NULL = NullRow(
 
 def null_row_for(model: NullModel | None, matcher: str, agl_m: float) -> NullRow:
     """Row for a height. The default row when there is no model, or it is of another version or another describer."""
-    usable = model is not None and model.version == VERSION and model.matcher == matcher and model.rows
+    usable = model is not None and model.version == SCORE_VERSION and model.matcher == matcher and model.rows
     return model.row_at(agl_m) if model is not None and usable else DEFAULT_NULL
 
 

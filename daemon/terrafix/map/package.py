@@ -181,13 +181,7 @@ class LocalMap:
         self._elevation = None if dem is None else ElevationView(dem, package.tiles, self._local, package.crs)
 
     def window(
-        self,
-        e_min_m: float,
-        n_max_m: float,
-        width_px: int,
-        height_px: int,
-        gsd_m: float,
-        layer: str | None = None,
+        self, e_min_m: float, n_max_m: float, width_px: int, height_px: int, gsd_m: float, layer: str | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """North-up image: (height_px, width_px, 3) uint8 BGR and validity mask (height_px, width_px) bool.
 

@@ -7,18 +7,9 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from terrafix.map.format import (
-    DEM_NULL,
-    DEM_TILE_PX,
-    ELEVATION_TABLE,
-    HASH_TABLE,
-    TILE_PX,
-    HashRow,
-    Level,
-    tile_sha256,
-)
+from terrafix.map.format import DEM_NULL, DEM_TILE_PX, ELEVATION_TABLE, HASH_TABLE, TILE_PX, HashRow, Level, tile_sha256
 
-CACHE_BYTES = 32_000_000  # decoded tiles; about 160; a window of 1 km needs 80 at 0.5 m/px and 320 at 0.24 m/px
+TILE_CACHE_BYTES = 32_000_000  # decoded tiles; about 160; a window of 1 km needs 80 at 0.5 m/px and 320 at 0.24 m/px
 VOID_BYTES = 100  # cost of a missing tile in the cache, so that the number of missing tiles is bounded, too
 
 Key = tuple[str, int, int, int]  # table, zoom, column, row
@@ -47,7 +38,7 @@ class TileStore:
         tile = self._load(key)
         self._cache[key] = tile
         self._cached_bytes += _size(tile)
-        while self._cached_bytes > CACHE_BYTES:
+        while self._cached_bytes > TILE_CACHE_BYTES:
             self._cached_bytes -= _size(self._cache.popitem(last=False)[1])
         return tile
 

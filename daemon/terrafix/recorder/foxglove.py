@@ -100,7 +100,7 @@ class Log(Stamped, frozen=True, kw_only=True):
 
 
 # Channels: topic and type of message. The schema is named foxglove.<type>.
-CHANNELS: dict[str, type[Stamped]] = {
+FOXGLOVE_CHANNELS: dict[str, type[Stamped]] = {
     LOCATION_TOPIC: LocationFix,
     POSE_TOPIC: PoseInFrame,
     LOG_TOPIC: Log,
@@ -154,12 +154,12 @@ def _pose(estimate: NavEstimate, frame: LocalFrame) -> PoseInFrame:
 
 
 def schema_name(topic: str) -> str:
-    return f"foxglove.{CHANNELS[topic].__name__}"
+    return f"foxglove.{FOXGLOVE_CHANNELS[topic].__name__}"
 
 
 def schema_of(topic: str) -> bytes:
     """JSON schema of a channel, without references."""
-    full = msgspec.json.schema(CHANNELS[topic])
+    full = msgspec.json.schema(FOXGLOVE_CHANNELS[topic])
     return msgspec.json.encode(_resolved(full, full["$defs"]) | {"title": schema_name(topic)})
 
 

@@ -11,8 +11,8 @@ from terrafix.recorder.images import ImagePolicy
 from terrafix.recorder.provenance import header
 from terrafix.recorder.segments import FRAME_IMAGE, SegmentRing
 
-QUEUE_LENGTH = 8192  # about 30 s of all messages; a longer queue would only hide a disk that is too slow
-FLUSH_S = 0.25  # interval of flushes: at most this much of the record is lost when the process is killed
+RECORD_QUEUE_LENGTH = 8192  # about 30 s of all messages; a longer queue would only hide a disk that is too slow
+RECORD_FLUSH_S = 0.25  # interval of flushes: at most this much of the record is lost when the process is killed
 CLOSE_TIMEOUT_S = 10.0
 
 
@@ -33,7 +33,7 @@ class RecorderEdge:
         self._ring = ring
         self._frames = frames
         self._images = images
-        self._queue: queue.Queue[tuple[int, Message]] = queue.Queue(QUEUE_LENGTH)
+        self._queue: queue.Queue[tuple[int, Message]] = queue.Queue(RECORD_QUEUE_LENGTH)
         self._dropped: Counter[str] = Counter()
         self._dropped_lock = threading.Lock()
         self._now_ns = 0
@@ -68,7 +68,7 @@ class RecorderEdge:
             if closing:
                 self._ring.close()
                 return
-            self._closing.wait(FLUSH_S)
+            self._closing.wait(RECORD_FLUSH_S)
 
     def _drain(self) -> None:
         while True:

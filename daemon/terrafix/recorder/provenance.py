@@ -5,7 +5,6 @@ import platform
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -27,10 +26,11 @@ _MAP_KEYS = ("name", "checksum", "date", "source", "built_with")
 _DEVICE_NAMES = ("/proc/device-tree/model", "/sys/class/dmi/id/product_name")
 
 
-def header(config: Config, map_path: Path | None = None, facts: Sequence[tuple[str, str]] = ()) -> dict[str, str]:
-    """Header of every file of a record. The camera of the flight is in its Origin, and repeated as `calibration`.
+def header(config: Config, map_path: Path | None = None) -> dict[str, str]:
+    """Header of every file of a record. The camera of the flight is in its Origin, and repeated as `calibration`; what
+    the source says of itself is in SourceFacts, and repeated as `source`.
 
-    ``map_path``: map package; None: there is none. ``facts``: what the source says of itself, by topic."""
+    ``map_path``: map package; None: there is none."""
     parts = {
         "config": without_passwords(config),
         "versions": versions(),
@@ -38,7 +38,7 @@ def header(config: Config, map_path: Path | None = None, facts: Sequence[tuple[s
         "models": models_of(config.models),
         "device": device(),
     }
-    return _encoded({**parts, "source": [list(fact) for fact in facts]} if facts else parts)
+    return _encoded(parts)
 
 
 def copied_header(found: dict[str, Any], **changed: Any) -> dict[str, str]:

@@ -24,7 +24,7 @@ from terrafix.messages import Message
 from terrafix.recorder.foxglove import IMAGE_TOPIC, THUMBNAIL_TOPIC
 from terrafix.recorder.provenance import RECORD_FORMAT
 from terrafix.recorder.schema import TYPE_BY_TOPIC, topic_of
-from terrafix.recorder.writer import CALIBRATION_NAME, HEADER_NAME, decode_image
+from terrafix.recorder.writer import CALIBRATION_NAME, HEADER_NAME, SOURCE_NAME, decode_image
 
 _SEGMENT = re.compile(r"flight-(\d+)\.mcap$")
 _RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # more than any valid record; a corrupt length must not allocate gigabytes
@@ -50,7 +50,8 @@ _DECODERS = {topic: msgspec.json.Decoder(t).decode for topic, t in TYPE_BY_TOPIC
 class ReadResult:
     """Properties of the record, filled while the iterator of a read function runs."""
 
-    # Of the first file: format, config, versions, map, models, device; camera of the flight: calibration
+    # Of the first file: format, config, versions, map, models, device; calibration: camera of the flight; source: what
+    # it says of itself, by topic
     header: dict[str, Any] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     truncated_files: list[Path] = field(default_factory=list)  # without their end (kill, power failure, full disk)
@@ -191,6 +192,8 @@ def _records_of(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[t
             result.header = result.header or _header(record.metadata)
         elif isinstance(record, Metadata) and record.name == CALIBRATION_NAME:
             result.header.setdefault("calibration", _decoded(record.metadata.get("camera", "{}")))
+        elif isinstance(record, Metadata) and record.name == SOURCE_NAME:
+            result.header.setdefault("source", _decoded(record.metadata.get("facts", "[]")))
         elif isinstance(record, McapMessage) and record.channel_id in channels:
             if first:
                 result.segment_starts_ns.append(record.publish_time)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from terrafix.core import logs
 from terrafix.core.errors import OutputError
-from terrafix.messages import Message
+from terrafix.messages import Message, Origin, SourceFacts
 from terrafix.recorder.reader import flight_files
 from terrafix.recorder.writer import FlightWriter
 
@@ -54,7 +54,7 @@ class SegmentRing:
         self._writer: FlightWriter | None = None
         self._opened_ns: int | None = None
         # Written at the start of every segment, so that each segment can be evaluated when earlier ones are deleted.
-        self._origin: Message | None = None
+        self._repeated: dict[str, Message] = {}
         self._lost: Counter[str] = Counter()
         self._unflushed: Counter[str] = Counter()  # lost with the chunk that they are in, if the disk does not take it
         self._blocked = ""  # reason why nothing is written
@@ -72,8 +72,8 @@ class SegmentRing:
         """``received_ns``: time of reception at the recorder."""
         if self._opened_ns is None:
             self._opened_ns = received_ns
-        if type(message).__name__ == "Origin":
-            self._origin = message
+        if isinstance(message, (Origin, SourceFacts)):
+            self._repeated[type(message).__name__] = message
         if self._writer is None and self._clock_s() - self._tried_s >= RETRY_S:
             self._open()
         if self._writer is None:
@@ -195,8 +195,8 @@ class SegmentRing:
                 return
             number = 1 + max((int(path.stem.split("-")[1]) for path in _segments(self._folder)), default=-1)
             self._writer = self._new_file(self._folder / f"flight-{number:03d}.mcap")
-            if self._origin is not None:
-                self._writer.write(self._origin, self._origin.t_ns)
+            for message in self._repeated.values():
+                self._writer.write(message, message.t_ns)
         except (OSError, OutputError) as error:
             self._block(str(error))
             return

@@ -10,13 +10,14 @@ import msgspec
 from mcap.writer import CompressionType, Writer
 
 from terrafix.core.errors import OutputError
-from terrafix.messages import Message, Origin
+from terrafix.messages import Message, Origin, SourceFacts
 from terrafix.recorder import foxglove
 from terrafix.recorder.foxglove import IMAGE_TOPIC, THUMBNAIL_TOPIC, CompressedImage, FoxgloveMessages, Time
 from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 
 CHUNK_BYTES = 128 * 1024  # largest loss at a kill between two calls of flush(); also the unit of compression
-HEADER_NAME, CALIBRATION_NAME = "terrafix", "terrafix.calibration"  # metadata records
+# Metadata records
+HEADER_NAME, CALIBRATION_NAME, SOURCE_NAME = "terrafix", "terrafix.calibration", "terrafix.source"
 
 _encoder = msgspec.json.Encoder()
 
@@ -40,7 +41,7 @@ class FlightWriter:
         self._sequence = 0
         for message_type in MESSAGE_TYPES.values():
             self._register(topic_of(message_type), f"terrafix.{message_type.__name__}", schema_of(message_type))
-        for topic in foxglove.CHANNELS:
+        for topic in foxglove.FOXGLOVE_CHANNELS:
             self._register(topic, foxglove.schema_name(topic), foxglove.schema_of(topic))
         self._foxglove = FoxgloveMessages()
         self.flush()
@@ -50,6 +51,8 @@ class FlightWriter:
         self._add(topic_of(type(message)), _encoder.encode(message), message.t_ns, received_ns)
         if isinstance(message, Origin):
             self._mcap.add_metadata(CALIBRATION_NAME, {"camera": _encoder.encode(message.camera).decode()})
+        if isinstance(message, SourceFacts):
+            self._mcap.add_metadata(SOURCE_NAME, {"facts": _encoder.encode(message.facts).decode()})
         for topic, derived in self._foxglove.of(message):
             self._add(topic, _encoder.encode(derived), message.t_ns, received_ns)
 

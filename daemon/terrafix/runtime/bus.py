@@ -21,13 +21,14 @@ import zmq
 
 from terrafix.core import codec
 from terrafix.core.clock import now_ns
-from terrafix.messages import GpsInput, InputOrder, Message, Origin, ProcessEvent, SourceEnded
+from terrafix.messages import GpsInput, InputOrder, Message, Origin, ProcessEvent, SourceEnded, SourceFacts
 
-QUEUE_LENGTH = 1000  # messages per connection and side; beyond it the newest are lost, and counted by the subscriber
+# messages per connection and side; beyond it the newest are lost, and counted by the subscriber
+BUS_QUEUE_LENGTH = 1000
 RECONNECT_MS = 20  # interval of reconnection attempts to a restarted publisher
 LINGER_MS = 200  # time limit for sending queued messages at exit
-BURST = 500  # most messages received in one call, so that a burst cannot delay the ticks of a process
-HEADER = struct.Struct(">QQ")  # session id of the publisher, sequence number in the topic
+RECEIVE_BURST = 500  # most messages received in one call, so that a burst cannot delay the ticks of a process
+BUS_HEADER = struct.Struct(">QQ")  # session id of the publisher, sequence number in the topic
 
 NO_EXPIRY_NS = 2**63
 
@@ -43,6 +44,7 @@ class Retention(NamedTuple):
 # sends to the autopilot is recorded although the recorder connects late, on a computer with too much to do.
 RETAINED: dict[type[Message], Retention] = {
     Origin: Retention(1, NO_EXPIRY_NS),
+    SourceFacts: Retention(1, NO_EXPIRY_NS),
     SourceEnded: Retention(1, NO_EXPIRY_NS),
     ProcessEvent: Retention(100, 10_000_000_000),
     GpsInput: Retention(100, 10_000_000_000, until_recorded=True),
@@ -62,7 +64,7 @@ class Publisher:
         # A subscription becomes active in ``serve``. Otherwise it could become active during a send, and the subscriber
         # would receive the message being sent before the retained ones.
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
-        self.socket.setsockopt(zmq.SNDHWM, QUEUE_LENGTH)
+        self.socket.setsockopt(zmq.SNDHWM, BUS_QUEUE_LENGTH)
         self.socket.setsockopt(zmq.LINGER, LINGER_MS)
         self.socket.bind(address)  # replaces the socket file of a killed process
         self._session_id = int.from_bytes(os.urandom(8), "big")
@@ -78,7 +80,7 @@ class Publisher:
         self.serve()
         name = topic(type(message))
         self._sequence[name] += 1
-        parts = [name, HEADER.pack(self._session_id, self._sequence[name]), codec.encode(message)]
+        parts = [name, BUS_HEADER.pack(self._session_id, self._sequence[name]), codec.encode(message)]
         retention = RETAINED.get(type(message))
         if retention is not None and not (retention.until_recorded and self.subscriptions(InputOrder)):
             self._retained[name].append((self._clock(), parts))
@@ -112,7 +114,7 @@ class Subscriber:
         self, context: zmq.Context[zmq.Socket[bytes]], addresses: Iterable[str], kinds: Iterable[type[Message]]
     ) -> None:
         self.socket = context.socket(zmq.SUB)
-        self.socket.setsockopt(zmq.RCVHWM, QUEUE_LENGTH)
+        self.socket.setsockopt(zmq.RCVHWM, BUS_QUEUE_LENGTH)
         self.socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
         for kind in kinds:
             self.socket.setsockopt(zmq.SUBSCRIBE, topic(kind))
@@ -122,8 +124,8 @@ class Subscriber:
         self.lost: Counter[str] = Counter()
 
     def receive(self) -> Iterator[Message]:
-        """The messages that have arrived, at most BURST, without blocking."""
-        for _ in range(BURST):
+        """The messages that have arrived, at most RECEIVE_BURST, without blocking."""
+        for _ in range(RECEIVE_BURST):
             try:
                 name, header, body = self.socket.recv_multipart(zmq.DONTWAIT)
             except zmq.Again:
@@ -132,7 +134,7 @@ class Subscriber:
                 yield codec.decode(body)
 
     def _is_new(self, name: bytes, header: bytes) -> bool:
-        session_id, sequence = HEADER.unpack(header)
+        session_id, sequence = BUS_HEADER.unpack(header)
         last = self._last[name].get(session_id)
         if last is not None and sequence <= last:
             return False  # a retained message, sent again for another subscriber

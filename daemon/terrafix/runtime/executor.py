@@ -25,7 +25,7 @@ from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
 
 EDGE_PERIOD_NS = 10_000_000  # longest interval between polls of an edge; 100 idle polls a second take 1 % of a core
-IDLE_NS = 50_000_000  # longest interval between progress stamps of a process that waits for messages
+IDLE_STAMP_NS = 50_000_000  # longest interval between progress stamps of a process that waits for messages
 DROPPED_PERIOD_NS = 1_000_000_000  # shortest interval between reports of lost messages
 SUBSCRIBERS_WAIT_NS = 20_000_000_000  # longest wait of the source for the subscribers of Origin and the first frames
 # Longest wait of a started process for the recorder's subscription (RECONNECT_MS and a turn of its loop): what is
@@ -192,7 +192,7 @@ class LiveShell:
     def _wait(self) -> None:
         """Waits for a message, at most until the next tick or poll of the edge is due."""
         now = now_ns()
-        until = now + (IDLE_NS if self._edge is None else EDGE_PERIOD_NS)
+        until = now + (IDLE_STAMP_NS if self._edge is None else EDGE_PERIOD_NS)
         if self._ticker is not None:
             until = min(until, self._ticker.next_ns)
         if until > now:

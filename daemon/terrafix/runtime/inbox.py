@@ -6,10 +6,10 @@ from typing import cast
 
 import msgspec
 
-from terrafix.messages import Message, Odometry, Origin, Prediction, SourceEnded
+from terrafix.messages import Message, Odometry, Origin, Prediction, SourceEnded, SourceFacts
 
 CAPACITY = 2000  # messages; about 10 s of all messages that the busiest process receives
-NEVER_DROPPED: tuple[type[Message], ...] = (Origin, SourceEnded)  # published once a flight
+NEVER_DROPPED: tuple[type[Message], ...] = (Origin, SourceFacts, SourceEnded)  # published once a flight
 
 
 def merge_predictions(older: Message, newer: Message) -> Message:

@@ -24,7 +24,8 @@ FIRST_START_LIMIT_NS = 300_000_000_000  # imports, and engines that are built wh
 START_LIMIT_NS = 60_000_000_000  # a process that was ready before has already built its engines
 STOP_LIMIT_S = 5.0  # from SIGTERM to SIGKILL
 KILL_LIMIT_S = 1.0  # from SIGKILL to the exit; it takes longer if a driver blocks the process in the kernel
-PAUSE_NS = 500_000_000  # between two checks; one takes some TRACEBACK_S at most [spec: ten periods of the supervisor]
+# between two checks; one takes some TRACEBACK_S at most [spec: ten periods of the supervisor]
+CHECK_PAUSE_NS = 500_000_000
 TRACEBACK_S = 0.2  # for a stuck process to print its tracebacks
 
 
@@ -128,7 +129,7 @@ class ManagedProcess:
     def check(self, now_ns: int) -> Iterator[Event]:
         """One check of the process: starts, restarts or kills it if necessary. Yields the resulting events, at first
         that it was adopted."""
-        if self._checked_ns and now_ns - self._checked_ns > PAUSE_NS:
+        if self._checked_ns and now_ns - self._checked_ns > CHECK_PAUSE_NS:
             self._resumed_ns = now_ns
         self._checked_ns = now_ns
         if self._adopted and self._forked is not None:

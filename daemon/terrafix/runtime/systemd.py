@@ -12,7 +12,7 @@ from typing import Any, TextIO
 
 from terrafix.core.logs import LineStream
 
-PRIORITY = {"error": 3, "warning": 4, "info": 6, "debug": 7}  # syslog(3)
+SYSLOG_PRIORITY = {"error": 3, "warning": 4, "info": 6, "debug": 7}  # syslog(3)
 IDENTIFIER = "terrafix"  # SyslogIdentifier= of the unit
 
 
@@ -78,7 +78,7 @@ class JournalStream:
         with contextlib.suppress(OSError):
             self._send(
                 message,
-                PRIORITY=PRIORITY.get(level, PRIORITY["info"]),
+                SYSLOG_PRIORITY=SYSLOG_PRIORITY.get(level, SYSLOG_PRIORITY["info"]),
                 SYSLOG_IDENTIFIER=IDENTIFIER,
                 TERRAFIX_EVENT=event,
                 TERRAFIX_TIME=str(time),

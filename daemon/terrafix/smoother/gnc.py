@@ -12,9 +12,9 @@ import numpy as np
 
 MU_GROWTH = 2.5  # of mu per step; the paper's 1.4 takes three times the steps to the same result
 MAX_MU = 8.0  # at which squares with a weight between 0 and 1 lie within an eighth of the limit
-MAX_STEPS = 60
+MAX_GNC_STEPS = 60
 MAX_FINAL_STEPS = 8
-STEP_TOLERANCE = 1e-3  # root mean square of a converged step, metres and radians
+GNC_STEP_TOLERANCE = 1e-3  # root mean square of a converged step, metres and radians
 INLIER_WEIGHT = 0.5
 
 Covariances = gtsam.Marginals | gtsam.GaussianBayesTree
@@ -40,7 +40,7 @@ def solve(
     worst = float(np.max(squares / limits, initial=0.0))
     if worst > 1.0:
         mu = 1.0 / (2.0 * worst - 1.0)
-        for _ in range(MAX_STEPS):
+        for _ in range(MAX_GNC_STEPS):
             values, _ = _step(weighted(certain, candidates, weights), values)
             weights = truncated_weights(_squares(candidates, values), limits, mu)
             if mu > MAX_MU:
@@ -57,7 +57,7 @@ def settle(
     graph = weighted(certain, candidates, inliers.astype(float))
     for _ in range(MAX_FINAL_STEPS):
         values, moved = _step(graph, values)
-        if moved < STEP_TOLERANCE:
+        if moved < GNC_STEP_TOLERANCE:
             break
     return values
 

@@ -17,10 +17,10 @@ from terrafix.core.pose import TRANSLATION
 
 # Keyframes in the graph, which bounds the time of a solution: beyond, the keyframe whose neighbours are closest in time
 # follows the one before it. [measured: docs/decisions/039-smoother-in-flight.md]
-MAX_KEYFRAMES = 256
+MAX_SMOOTHED_KEYFRAMES = 256
 # Frames, of which the oldest without others that hang on them are dropped first: 34 minutes at 2 Hz, in 5.5 MB. What
 # was published of a dropped one stays. [measured: docs/decisions/039-smoother-in-flight.md]
-MAX_FRAMES = 4096
+MAX_SMOOTHED_FRAMES = 4096
 MAX_ANCHORS = 3  # of one keyframe that contradict each other [spec: one more than can outvote each other]
 LONE_FRAMES = 32  # newer frames after which one that nothing hangs on is dropped [spec: twice the estimator's window]
 
@@ -69,7 +69,7 @@ class Join:
 class KeyframeGraph:
     """``frames`` by id, in the order of the flight; ``anchors`` by the id of their keyframe; ``joins``."""
 
-    def __init__(self, max_keyframes: int = MAX_KEYFRAMES) -> None:
+    def __init__(self, max_keyframes: int = MAX_SMOOTHED_KEYFRAMES) -> None:
         self.frames: OrderedDict[int, FrameNode] = OrderedDict()
         self.anchors: dict[int, list[Anchor]] = {}
         self.joins: list[Join] = []
@@ -100,7 +100,7 @@ class KeyframeGraph:
         self._lone[node.frame_id] = None
         if len(self._lone) > LONE_FRAMES:
             self._drop(next(iter(self._lone)))
-        if len(self.frames) > MAX_FRAMES:
+        if len(self.frames) > MAX_SMOOTHED_FRAMES:
             self._drop(next(frame_id for frame_id in self.frames if frame_id not in self._children))
 
     def add_link(self, node: FrameNode) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
 from terrafix.core.map_error import shared_variance_m2
 from terrafix.core.node import NodeContext
-from terrafix.core.pose import tangent_to_world, world_to_tangent
+from terrafix.core.pose import HORIZONTAL, tangent_to_world, world_to_tangent
 from terrafix.messages import (
     CovarianceMode,
     Message,
@@ -31,12 +31,12 @@ from terrafix.messages import (
 from terrafix.smoother.keyframe_graph import NO_AMBIGUITY_M2, Anchor, FrameNode, Join, KeyframeGraph
 from terrafix.smoother.solution import Placed, followers, predict, solve
 
-PERIOD_NS = 1_000_000_000  # from one Refinement to the next, at least [spec: once a second]
-IDLE_NS = 5_000_000_000  # from one solution to the next, while map matches move nothing [spec: a merge within 5 s]
+REFINEMENT_PERIOD_NS = 1_000_000_000  # from one Refinement to the next, at least [spec: once a second]
+# from one solution to the next, while map matches move nothing [spec: a merge within 5 s]
+IDLE_SOLUTION_NS = 5_000_000_000
 MAX_POSES = 128  # of a Refinement; the others follow in the next ones [spec: 50 kB]
 # Change of a pose, or of its 1-sigma, in 1-sigma, from which it is published again. [spec: changes no decision below]
-MOVED_SIGMAS = 0.25
-HORIZONTAL = slice(0, 2)
+MOVED_POSE_SIGMAS = 0.25
 # Random walk of the scale from frame to frame, as a share: of a height that is known, and of one that is not.
 KNOWN_HEIGHT_WALK, ASSUMED_HEIGHT_WALK = 0.002, 0.02  # [spec: of finalise]
 KNOWN_HEIGHT = 0.1  # 1-sigma of a known height, as a share [spec: docs/finalise.md]
@@ -92,9 +92,9 @@ class SmootherNode:
     def _take(self, message: Message) -> Iterable[Message]:
         self._handlers[type(message)](message)
         now_ns = self._now_ns = max(message.t_ns, self._now_ns)  # a map match has the time of its frame
-        period_ns = PERIOD_NS if self._shift2 > MOVED_SIGMAS**2 else IDLE_NS
+        period_ns = REFINEMENT_PERIOD_NS if self._shift2 > MOVED_POSE_SIGMAS**2 else IDLE_SOLUTION_NS
         solves = self._changed and _passed(self._solved_ns, now_ns, period_ns)
-        if self._hot or not (solves or self._behind) or not _passed(self._published_ns, now_ns, PERIOD_NS):
+        if self._hot or not (solves or self._behind) or not _passed(self._published_ns, now_ns, REFINEMENT_PERIOD_NS):
             return
         if solves:
             self._changed, self._shift2, self._solved_ns = False, 0.0, now_ns
@@ -204,7 +204,9 @@ class SmootherNode:
         moved, sigma = p_m - was_m, np.sqrt(np.diag(cov))
         was_sigma = np.sqrt(np.diag(was_cov))
         distance2 = float(moved @ np.linalg.solve(cov, moved))
-        return distance2 > MOVED_SIGMAS**2 or bool((np.abs(sigma - was_sigma) > MOVED_SIGMAS * was_sigma).any())
+        return distance2 > MOVED_POSE_SIGMAS**2 or bool(
+            (np.abs(sigma - was_sigma) > MOVED_POSE_SIGMAS * was_sigma).any()
+        )
 
     def _refined(self, frame_id: int, placed: Placed, p_m: np.ndarray, cov: np.ndarray) -> RefinedPose:
         assert self._axes is not None

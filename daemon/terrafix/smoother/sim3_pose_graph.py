@@ -15,19 +15,13 @@ from terrafix.core.gate import GATE
 from terrafix.core.pose import TRANSLATION
 from terrafix.smoother.gnc import Covariances, OutlierCandidate, marginals, settle, solve, weighted
 from terrafix.smoother.sim3_consensus import Similarity, place
-from terrafix.smoother.submap_types import (
-    AbsoluteConstraint,
-    MergedSubmaps,
-    RelativeConstraint,
-    Submap,
-    SubmapPose,
-)
+from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, RelativeConstraint, Submap, SubmapPose
 
 # Precisions of a weak prior on every submap, which keeps the system solvable without inliers: sigmas of 10 rad, 1 km,
 # and e^3 of the scale.
 LOOSE = np.array([1e-2] * 3 + [1e-6] * 3 + [0.1])
 # Tangent of a similarity in GTSAM: that of the pose, then the logarithm of the scale.
-POSE, LOG_SCALE = slice(0, 6), 6
+POSE_OF_SIM3, LOG_SCALE = slice(0, 6), 6
 MAX_SCALE_SIGMA = 0.3  # share: a submap with a less certain scale is not placed
 READMISSIONS = 3  # passes in which outliers that the drift of the others had excluded may become inliers
 
@@ -129,7 +123,7 @@ class Sim3PoseGraph:
             r_step, p_step = submap.steps()
             covs = np.zeros((len(submap), 7, 7))
             to_m = np.array([1.0, 1.0, 1.0, *([start.scale] * 3)])
-            covs[:, POSE, POSE] = submap.step_cov * np.outer(to_m, to_m)
+            covs[:, POSE_OF_SIM3, POSE_OF_SIM3] = submap.step_cov * np.outer(to_m, to_m)
             covs[:, LOG_SCALE, LOG_SCALE] = submap.scale_walk**2
             for i in range(len(submap)):
                 values.insert(key + i, gtsam.Similarity3(r_w[i], p_w[i], 1.0))
@@ -164,9 +158,9 @@ class Sim3PoseGraph:
         key = self._first_key[anchor.submap] + anchor.keyframe
         pose = gtsam.Similarity3(anchor.r_w_c, anchor.p_c_in_w_m, 1.0)
         information = np.zeros((7, 7))
-        information[POSE, POSE] = np.linalg.inv(anchor.cov)
+        information[POSE_OF_SIM3, POSE_OF_SIM3] = np.linalg.inv(anchor.cov)
         square_root = np.zeros((7, 7))
-        square_root[POSE, POSE] = np.linalg.cholesky(information[POSE, POSE]).T
+        square_root[POSE_OF_SIM3, POSE_OF_SIM3] = np.linalg.cholesky(information[POSE_OF_SIM3, POSE_OF_SIM3]).T
 
         def factor(weight: float) -> gtsam.NonlinearFactor:
             noise = gtsam.noiseModel.Gaussian.SqrtInformation(np.sqrt(weight) * square_root, False)
@@ -182,7 +176,7 @@ class Sim3PoseGraph:
         step = gtsam.Similarity3(join.r_a_b, start_a.scale * join.p_b_in_a / ratio, ratio)
         to_m = np.array([1.0, 1.0, 1.0, *([start_a.scale] * 3)])
         cov = np.zeros((7, 7))
-        cov[POSE, POSE] = join.cov * np.outer(to_m, to_m)
+        cov[POSE_OF_SIM3, POSE_OF_SIM3] = join.cov * np.outer(to_m, to_m)
         cov[LOG_SCALE, LOG_SCALE] = join.ratio_sigma**2
         keys = self._first_key[a] + i, self._first_key[b] + j
 
@@ -197,8 +191,8 @@ class Sim3PoseGraph:
         """Whether an anchor is consistent with the solution, given its covariance there."""
         key = self._first_key[anchor.submap] + anchor.keyframe
         pose = gtsam.Similarity3(anchor.r_w_c, anchor.p_c_in_w_m, 1.0)
-        residual = pose.localCoordinates(values.atSimilarity3(key))[POSE]
-        cov = found.marginalCovariance(key)[POSE, POSE] + anchor.cov
+        residual = pose.localCoordinates(values.atSimilarity3(key))[POSE_OF_SIM3]
+        cov = found.marginalCovariance(key)[POSE_OF_SIM3, POSE_OF_SIM3] + anchor.cov
         return float(residual @ np.linalg.solve(cov, residual)) <= GATE[6]
 
     # --- result -----------------------------------------------------------------------------------------
@@ -217,7 +211,7 @@ class Sim3PoseGraph:
         return SubmapPose(
             r_w_c=np.array([s.rotation().matrix() for s in states]),
             p_c_in_w_m=np.array([s.translation() for s in states]) * scales[:, None],
-            cov=covs[:, POSE, POSE],
+            cov=covs[:, POSE_OF_SIM3, POSE_OF_SIM3],
             m_per_unit=scales * start.scale,
         )
 

@@ -13,7 +13,7 @@ from terrafix.smoother.sim3_pose_graph import merge
 from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, RelativeConstraint, Submap
 
 SAME_SCALE = 0.01  # 1-sigma of the ratio of two scales, as a share [spec: as of two nodes of one frame]
-MAX_SCALE_SIGMA = 0.3  # a height known no better does not give the scale [spec: of sim3_pose_graph]
+MAX_HEIGHT_SIGMA = 0.3  # a height known no better does not give the scale [spec: of sim3_pose_graph]
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _submap(graph: KeyframeGraph, piece: list[int]) -> Submap:
         cov[i], walk[i] = node.cov, np.sqrt(node.walk2)
         sigmas.append(node.scale_sigma)
     known = float(np.median(sigmas)) if sigmas else 0.0
-    scale_sigma = float(np.hypot(known, SAME_SCALE)) if known <= MAX_SCALE_SIGMA else None
+    scale_sigma = float(np.hypot(known, SAME_SCALE)) if known <= MAX_HEIGHT_SIGMA else None
     r_f_c, p_c_in_f = np.array([pose.rotation().matrix() for pose in poses]), np.array([p.translation() for p in poses])
     return Submap(r_f_c, p_c_in_f, parent, cov, scale_sigma, walk)
 

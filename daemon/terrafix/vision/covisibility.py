@@ -13,7 +13,7 @@ from terrafix.vision.features import FeatureMatcher, Features
 from terrafix.vision.two_view import TwoView, TwoViewGeometry
 
 LINKS = 3  # keyframes that a frame is registered to [measured: docs/decisions/040]
-CANDIDATES = 5  # that are verified [measured: docs/decisions/040]
+WINDOW_CANDIDATES = 5  # that are verified [measured: docs/decisions/040]
 # Width of a smaller copy, and features of it, that are compared with every keyframe: of village-1's pairs within half a
 # height, 40 frames and more apart, 86 % are found (360 px: 71 %), and none of 532 pairs four heights apart.
 COARSE_WIDTH_PX, COARSE_FEATURES = 480, 300
@@ -50,10 +50,10 @@ class Covisibility:
 
     def links(self, keyframes: Sequence[DescribedImage], view: DescribedImage) -> list[tuple[int, TwoView]]:
         """The keyframes of which ``view`` shows ground, as indices, with what both show: at most LINKS, the one with
-        most inliers first. The CANDIDATES with most coarse matches are verified, in this order."""
+        most inliers first. The WINDOW_CANDIDATES with most coarse matches are verified, in this order."""
         shared = [self._matcher.shared(keyframe.coarse, view.coarse) for keyframe in keyframes]
         seen, verified, most = dict[int, TwoView](), dict[int, TwoView](), 0
-        for i in sorted(range(len(keyframes)), key=lambda i: -shared[i])[:CANDIDATES]:
+        for i in sorted(range(len(keyframes)), key=lambda i: -shared[i])[:WINDOW_CANDIDATES]:
             # After an easy pair only those keyframes are compared that are likely to show as much.
             if len(verified) == LINKS or (most >= WEAK_INLIERS and shared[i] < LIKELY_SHARE * max(shared)):
                 break

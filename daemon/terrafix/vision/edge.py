@@ -13,16 +13,19 @@ import msgspec
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
+from terrafix.core.flight_id import live_flight_id
 from terrafix.core.frames import FrameWriter
 from terrafix.core.initial_position import Bounds, map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import Edge, NodeContext
-from terrafix.messages import OVERTAKEN, Health, Message, SourceEnded
+from terrafix.messages import OVERTAKEN, Exposure, Health, Message, SourceEnded, SourceFacts
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_configured
+from terrafix.vision.sources.exposed import ReportedExposures
+from terrafix.vision.sources.facts import facts_of
 
 QUEUE_SHOTS = 3  # shots with pixels that are read ahead from a recording that is not played in real time
 MAX_DROPPED_MESSAGES = 1024  # dropped frames and their telemetry, without pixels; 20 s at 50 Hz
-MAX_LATE_NS = 2_000_000_000  # a recording that lags real time by more than this skips ahead
+MAX_LAG_NS = 2_000_000_000  # a recording that lags real time by more than this skips ahead
 
 
 class SourceEdge:
@@ -54,6 +57,7 @@ class SourceEdge:
         self._first_id = 0
         self._changed = threading.Condition()
         self._shots: deque[Shot] = deque()
+        self._exposures = ReportedExposures()
         self._dropped: deque[Message] = deque(maxlen=MAX_DROPPED_MESSAGES)
         self._stopping = threading.Event()
         self._count = 0
@@ -72,7 +76,10 @@ class SourceEdge:
                 self._source.origin() if self._bounds is None else with_map_center(self._source.origin(), self._bounds)
             )
             ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
-            return [msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m)]
+            said = SourceFacts(t_ns=self._zero_ns, facts=tuple(facts_of(self._source)))
+            flight_id = live_flight_id(self._zero_ns)
+            origin = msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m, flight_id=flight_id)
+            return [origin, said]
         ended = self._reading.done()
         with self._changed:
             messages = list(self._dropped)
@@ -82,7 +89,8 @@ class SourceEdge:
         if shot is not None:
             if shot.image is not None:
                 self._frames.put(shot.frame.frame_id, shot.image)
-            messages += [*shot.imu, *shot.states, *shot.others, shot.frame]
+            frame = self._exposures.exposed(shot.frame) if self._source.live else shot.frame
+            messages += [*shot.imu, *shot.states, *shot.others, frame]
         elif ended and not self._end_published:
             self._reading.result()  # re-raises an exception of the reader thread in this process
             self._end_published = True
@@ -90,7 +98,9 @@ class SourceEdge:
         return messages
 
     def on_message(self, message: Message) -> None:
-        """Takes the thermal band of Health."""
+        """Takes the thermal band of Health, and exposures."""
+        if isinstance(message, Exposure):
+            self._exposures.add(message)
         if isinstance(message, Health) and self._rate is not None:
             self._rate.band = message.band
 
@@ -121,7 +131,7 @@ class SourceEdge:
             timed = self._to_system_time(shot)
             if self._realtime and not self._source.live:
                 late_ns = now_ns() - timed.frame.t_ns
-                if late_ns > MAX_LATE_NS and index > 0:  # the first shot is always published, to guarantee progress
+                if late_ns > MAX_LAG_NS and index > 0:  # the first shot is always published, to guarantee progress
                     return now_ns() - self._zero_ns
                 if late_ns < 0 and self._stopping.wait(-late_ns / 1e9):
                     return -1

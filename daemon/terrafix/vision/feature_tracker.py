@@ -11,7 +11,7 @@ from terrafix.core.limits import MAX_KEYFRAME_AGE, WINDOW_NODES
 from terrafix.core.node import Image
 from terrafix.messages import Verdict
 from terrafix.vision.covisibility import Covisibility, DescribedImage
-from terrafix.vision.features import FeatureMatcher, SiftMatcher
+from terrafix.vision.features import NO_POINTS, FeatureMatcher, SiftMatcher
 from terrafix.vision.patch_alignment import align_patches
 from terrafix.vision.two_view import (
     RANSAC_PX,
@@ -30,21 +30,21 @@ MAX_CORNERS = 400
 MIN_CORNER_DISTANCE_PX = 12
 KLT_WINDOW_PX = 21
 KLT_LEVELS = 4
-FORWARD_BACKWARD_PX = 1.0  # forward-backward check: larger return error rejects a track (Kalal 2010)
+TRACK_RETURN_PX = 1.0  # forward-backward check: larger return error rejects a track (Kalal 2010)
 TRACK_MIN_INLIERS = 20
-MIN_INLIER_RATIO = 0.35
+TRACK_MIN_INLIER_RATIO = 0.35
 # Median shift for a new keyframe, fraction of the image width: nine tenths still overlap. It moves smoothly and far
 # from frame to frame, where the number of corners that are still tracked falls by a few: as the first to be reached, it
 # chooses the same frame whichever of these are lost.
 KEYFRAME_SHIFT = 0.12
 KEYFRAME_TRACKED = 0.3  # minimum fraction of the keyframe's corners that are still tracked
-MAX_FAILURES = 5  # consecutive registration failures before a new fragment starts (PB-5)
-MAX_PAIRS = 48
+MAX_TRACK_FAILURES = 5  # consecutive registration failures before a new fragment starts (PB-5)
+MAX_ODOMETRY_PAIRS = 48
 SIGMA_PX = 0.75  # 1-sigma of a matched coordinate; tracks drift with rotation and exposure steps (measured 0.4 to 0.9)
-MAX_TRIPLES, MIN_TRIPLES = 96, 12
+MAX_ODOMETRY_TRIPLES, MIN_ODOMETRY_TRIPLES = 96, 12
 ALIGNED_SIGMA_PX = 0.25  # 1-sigma of a corner coordinate after patch alignment (measured 0.13 to 0.6)
 
-_NO_POINTS, _NO_TRIPLES, _NONE = np.zeros((0, 2), np.float32), np.zeros((0, 6)), np.zeros(0, int)
+_NO_TRIPLES, _NONE = np.zeros((0, 6)), np.zeros(0, int)
 
 
 @dataclass
@@ -142,11 +142,11 @@ class FrameTracker:
             return self._new_fragment(frame_id, gray)
         keyframe.age += 1
         index, points, tracked = self._track_klt(keyframe, gray)
-        enough = len(index) >= max(TRACK_MIN_INLIERS, MIN_INLIER_RATIO * tracked)
+        enough = len(index) >= max(TRACK_MIN_INLIERS, TRACK_MIN_INLIER_RATIO * tracked)
         if enough and self._covers_images(keyframe.corners[index], points):
             return self._accept_tracks(keyframe, frame_id, gray, index, points, tracked)
         detail = _gray_copy(image, self._detail_scale) if self._detail_scale > self._scale else None
-        current = _Keyframe(frame_id, gray, _NO_POINTS, _NO_POINTS, -1, self._covisibility.describe(gray, detail))
+        current = _Keyframe(frame_id, gray, NO_POINTS, NO_POINTS, -1, self._covisibility.describe(gray, detail))
         # Two failed frames that match each other start a new fragment. One that matches nothing is a foreign frame.
         links = self._links(self._candidates(keyframe, frame_id), current)
         if not links and self._failed_frame is not None:
@@ -194,7 +194,7 @@ class FrameTracker:
         """KLT from the last tracked frame. -> indices (N,) of the keyframe's corners that agree with one homography,
         their positions (N, 2) px in this frame, and the number of tracked corners."""
         if self._last_gray is None or len(self._last_points) < TRACK_MIN_INLIERS:
-            return _NONE, _NO_POINTS, 0
+            return _NONE, NO_POINTS, 0
         window = (KLT_WINDOW_PX, KLT_WINDOW_PX)
         start = self._last_points.reshape(-1, 1, 2)
         ahead, ok, _ = cv2.calcOpticalFlowPyrLK(
@@ -203,7 +203,7 @@ class FrameTracker:
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
             gray, self._last_gray, ahead, start.copy(), winSize=window, maxLevel=KLT_LEVELS
         )
-        closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < FORWARD_BACKWARD_PX
+        closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < TRACK_RETURN_PX
         keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed
         positions, index = ahead.reshape(-1, 2)[keep], self._last_index[keep]
         inlier = homography_inliers(keyframe.corners[index], positions)
@@ -212,13 +212,7 @@ class FrameTracker:
         return index[inlier], positions[inlier], int(keep.sum())
 
     def _accept_tracks(
-        self,
-        keyframe: _Keyframe,
-        frame_id: int,
-        gray: np.ndarray,
-        index: np.ndarray,
-        points: np.ndarray,
-        tracked: int,
+        self, keyframe: _Keyframe, frame_id: int, gray: np.ndarray, index: np.ndarray, points: np.ndarray, tracked: int
     ) -> Motion:
         """``points`` (N, 2) px: tracked positions of the keyframe's corners ``index`` (N,)."""
         corners = keyframe.corners[index]
@@ -244,10 +238,10 @@ class FrameTracker:
     def _triples(self, keyframe: _Keyframe, positions: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Three-view matches (N, 6), normalised, of the corners ``index`` at ``positions`` (N, 2) px."""
         three = np.isfinite(keyframe.previous_corners[index, 0])
-        if three.sum() < MIN_TRIPLES:
+        if three.sum() < MIN_ODOMETRY_TRIPLES:
             return _NO_TRIPLES
         positions, index = positions[three], index[three]
-        pick = select_spread(keyframe.corners[index], MAX_TRIPLES, self._size_px)
+        pick = select_spread(keyframe.corners[index], MAX_ODOMETRY_TRIPLES, self._size_px)
         views = keyframe.previous_corners[index[pick]], keyframe.corners[index[pick]], positions[pick]
         return np.hstack([self._camera.normalise(px) for px in views])
 
@@ -282,16 +276,16 @@ class FrameTracker:
         )
 
     def _published(self, a: np.ndarray, b: np.ndarray, inliers: int, tracked: int) -> tuple[np.ndarray, float]:
-        """-> at most MAX_PAIRS of the matches (N, 2), (N, 2) px, normalised (M, 4), and the 1-sigma of a coordinate."""
-        pick = select_spread(a, MAX_PAIRS, self._size_px)
+        """-> at most MAX_ODOMETRY_PAIRS of the matches (N, 2), (N, 2) px, normalised (M, 4); 1-sigma of one."""
+        pick = select_spread(a, MAX_ODOMETRY_PAIRS, self._size_px)
         two_view = np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])])
         # A consensus with a low inlier ratio may be a roof instead of the ground: its sigma is larger.
         return two_view, SIGMA_PX / self._camera.fx / float(np.sqrt(inliers / tracked))
 
     def _reject(self, keyframe: _Keyframe, current: _Keyframe, tracked: int) -> Motion:
-        """Registration failed. Starts a new fragment after MAX_MISSES failures, or when the keyframe is too old."""
+        """Registration failed. Starts a new fragment after MAX_TRACK_FAILURES, or when the keyframe is too old."""
         self._failures += 1
-        if self._failures >= MAX_FAILURES or keyframe.age >= MAX_KEYFRAME_AGE:
+        if self._failures >= MAX_TRACK_FAILURES or keyframe.age >= MAX_KEYFRAME_AGE:
             return replace(self._new_fragment(current.frame_id, current.gray, current.view), view=current.view)
         self._failed_frame = current
         return Motion(
@@ -316,8 +310,8 @@ class FrameTracker:
         self,
         frame_id: int,
         gray: np.ndarray,
-        carried: np.ndarray = _NO_POINTS,
-        previous_corners: np.ndarray = _NO_POINTS,
+        carried: np.ndarray = NO_POINTS,
+        previous_corners: np.ndarray = NO_POINTS,
         previous_keyframe_id: int = -1,
         view: DescribedImage | None = None,
     ) -> None:
@@ -332,7 +326,7 @@ class FrameTracker:
             if missing_count
             else None
         )
-        new = corners.reshape(-1, 2).astype(np.float32) if corners is not None else _NO_POINTS
+        new = corners.reshape(-1, 2).astype(np.float32) if corners is not None else NO_POINTS
         found = np.vstack([carried, new])
         unseen = np.full((len(new), 2), np.nan, np.float32)
         self._keyframe = _Keyframe(

@@ -8,21 +8,18 @@ import numpy as np
 
 SIFT_FEATURES = 1500
 SIFT_RATIO = 0.8  # ratio test, Lowe 2004
-MIN_SIZE_PX = (
-    1.8  # diameter of the smallest feature that SIFT finds [spec: sigma of 1.6 px in an image of twice the size]
-)
+# diameter of the smallest feature that SIFT finds [spec: sigma of 1.6 px in an image of twice the size]
+MIN_SIZE_PX = 1.8
 
-_NO_POINTS, _NO_VALUES = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+NO_POINTS = np.zeros((0, 2), np.float32)
 
 
 @dataclass(frozen=True)
 class Features:
-    """``xy_px`` (N, 2) float32, ``descriptors`` (N, C) float32, ``angle_rad`` (N,): orientation in the image, clockwise
-    from its x axis; ``size_px`` (N,). The strongest feature is the first."""
+    """``xy_px`` (N, 2) float32, ``descriptors`` (N, C) float32, ``size_px`` (N,). The strongest one is first."""
 
     xy_px: np.ndarray
     descriptors: np.ndarray
-    angle_rad: np.ndarray
     size_px: np.ndarray
 
     def __len__(self) -> int:
@@ -32,24 +29,20 @@ class Features:
         """In pixels of the image resized by ``factor``."""
         # Pixel indices denote centres, as in CameraCalibration.scaled.
         xy_px = ((self.xy_px + 0.5) * factor - 0.5).astype(np.float32)
-        return Features(xy_px, self.descriptors, self.angle_rad, (self.size_px * factor).astype(np.float32))
+        return Features(xy_px, self.descriptors, (self.size_px * factor).astype(np.float32))
 
     def coarse(self, factor: float, count: int) -> "Features":
         """At most ``count`` of those that are large enough for the image resized by ``factor``, in pixels of that."""
         keep = np.flatnonzero(self.size_px * factor >= MIN_SIZE_PX)[:count]
-        kept = Features(self.xy_px[keep], self.descriptors[keep], self.angle_rad[keep], self.size_px[keep])
-        return kept.scaled(factor)
+        return Features(self.xy_px[keep], self.descriptors[keep], self.size_px[keep]).scaled(factor)
 
 
 @dataclass(frozen=True)
 class Matches:
-    """``a_px``, ``b_px`` (N, 2): the same points in two images. ``turn_rad`` (N,): by which each feature is rotated
-    from the first image to the second, ``octaves`` (N,): by which it grows, log2."""
+    """``a_px``, ``b_px`` (N, 2): the same points in two images."""
 
     a_px: np.ndarray
     b_px: np.ndarray
-    turn_rad: np.ndarray
-    octaves: np.ndarray
 
     def __len__(self) -> int:
         return len(self.a_px)
@@ -58,13 +51,11 @@ class Matches:
 class FeatureMatcher(Protocol):
     def describe(self, gray: np.ndarray) -> Features:
         """(H, W) uint8 -> its features."""
-        ...
 
     def match(self, first: Features, second: Features) -> Matches: ...
 
     def shared(self, first: Features, second: Features) -> int:
         """Number of matches, by the fastest method: which images are worth to be matched."""
-        ...
 
 
 class SiftMatcher:
@@ -77,20 +68,18 @@ class SiftMatcher:
     def describe(self, gray: np.ndarray) -> Features:
         keypoints, descriptors = self._sift.detectAndCompute(gray, None)
         if descriptors is None:
-            return Features(_NO_POINTS, np.zeros((0, 128), np.float32), _NO_VALUES, _NO_VALUES)
+            return Features(NO_POINTS, np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
         order = np.argsort([-k.response for k in keypoints], kind="stable")
         keypoints = [keypoints[i] for i in order]
         xy_px = np.array([k.pt for k in keypoints], np.float32)
-        angle_rad = np.radians(np.array([k.angle for k in keypoints], np.float32))
         size_px = np.array([k.size for k in keypoints], np.float32)
-        return Features(xy_px, descriptors[order], angle_rad, size_px)
+        return Features(xy_px, descriptors[order], size_px)
 
     def match(self, first: Features, second: Features) -> Matches:
         """Each feature is in one pair at most: of a photo with little texture, dozens of features are nearest to one
         and the same, and any number of such pairs agrees with a homography that maps the image into that point."""
         a, b = mutual_nearest(first.descriptors, second.descriptors)
-        octaves = np.log2(second.size_px[b] / first.size_px[a])
-        return Matches(first.xy_px[a], second.xy_px[b], second.angle_rad[b] - first.angle_rad[a], octaves)
+        return Matches(first.xy_px[a], second.xy_px[b])
 
     def shared(self, first: Features, second: Features) -> int:
         return len(mutual_nearest(first.descriptors, second.descriptors)[0])

@@ -14,7 +14,7 @@ import numpy as np
 from terrafix.vision.covisibility import COARSE_FEATURES
 from terrafix.vision.features import Features
 
-MAX_KEYFRAMES = 512  # 22 MiB; 18 km of new ground at 90 m above it [measured: docs/decisions/048]
+MAX_DATABASE_KEYFRAMES = 512  # 22 MiB; 18 km of new ground at 90 m above it [measured: docs/decisions/048]
 WORDS = 512
 VOCABULARY_KEYFRAMES = 8  # from whose descriptors the words are taken; before that all keyframes are candidates
 DESCRIPTOR_SIZE = 128  # [spec: SIFT]
@@ -41,7 +41,6 @@ class _Places:
     def __init__(self, count: int) -> None:
         self._xy_px = np.full((count, COARSE_FEATURES, 2), 0.0, np.float32)
         self._descriptors = np.full((count, COARSE_FEATURES, DESCRIPTOR_SIZE), 0, np.uint8)
-        self._angle_rad = np.full((count, COARSE_FEATURES), 0.0, np.float32)
         self._size_px = np.full((count, COARSE_FEATURES), 0.0, np.float32)
         self._histograms = np.full((count, WORDS), 0.0, np.float32)
         self._free = list(range(count))
@@ -49,23 +48,16 @@ class _Places:
 
     @property
     def size_bytes(self) -> int:
-        arrays = (self._xy_px, self._descriptors, self._angle_rad, self._size_px, self._histograms)
-        return sum(a.nbytes for a in arrays)
+        return sum(a.nbytes for a in (self._xy_px, self._descriptors, self._size_px, self._histograms))
 
     def put(self, frame_id: int, features: Features) -> tuple[Features, np.ndarray]:
         """-> the features as they are stored, the strongest COARSE_FEATURES, and a histogram of zeros. A place must be
         free."""
         place = self._of[frame_id] = self._free.pop()
         count = min(len(features), COARSE_FEATURES)
-        stored = Features(
-            self._xy_px[place, :count],
-            self._descriptors[place, :count],
-            self._angle_rad[place, :count],
-            self._size_px[place, :count],
-        )
+        stored = Features(self._xy_px[place, :count], self._descriptors[place, :count], self._size_px[place, :count])
         stored.xy_px[:] = features.xy_px[:count]
         stored.descriptors[:] = features.descriptors[:count]
-        stored.angle_rad[:] = features.angle_rad[:count]
         stored.size_px[:] = features.size_px[:count]
         self._histograms[place] = 0.0
         return stored, self._histograms[place]
@@ -77,7 +69,7 @@ class _Places:
 class KeyframeDatabase:
     """``add`` keyframes in order of time; ``candidates`` for an image."""
 
-    def __init__(self, max_keyframes: int = MAX_KEYFRAMES) -> None:
+    def __init__(self, max_keyframes: int = MAX_DATABASE_KEYFRAMES) -> None:
         self._max_keyframes = max_keyframes
         self._places = _Places(max_keyframes + 1)  # the newest is in before one is removed, which may be itself
         self._words: np.ndarray | None = None  # (WORDS, C)

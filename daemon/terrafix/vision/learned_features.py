@@ -53,9 +53,7 @@ class LearnedMatcher:
         assert isinstance(first, LearnedFeatures) and isinstance(second, LearnedFeatures)
         turns, _ = self._rotation(first, second)
         pairs, _ = self._matcher.match(first.turned[0], second.turned[turns])
-        angle_rad = np.full(len(pairs), turns * np.pi / 2.0, np.float32)
-        a, b = first.places[0][pairs[:, 0]], second.places[turns][pairs[:, 1]]
-        return Matches(a, b, angle_rad, np.zeros(len(pairs), np.float32))
+        return Matches(first.places[0][pairs[:, 0]], second.places[turns][pairs[:, 1]])
 
     def shared(self, first: Features, second: Features) -> int:
         return self._rotation(first, second)[1]
@@ -68,9 +66,7 @@ class LearnedMatcher:
 
 
 def _features(turned: tuple[Keypoints, ...], places: tuple[np.ndarray, ...]) -> LearnedFeatures:
-    count = len(turned[0].xy_px)
-    zero, one = np.zeros(count, np.float32), np.ones(count, np.float32)
-    return LearnedFeatures(places[0], turned[0].descriptors, zero, one, turned, places)
+    return LearnedFeatures(places[0], turned[0].descriptors, np.ones(len(places[0]), np.float32), turned, places)
 
 
 def _turned_back(xy_px: np.ndarray, turns: int, width: int, height: int) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 from terrafix.vision.two_view import fit_homography
 
 WINDOW_PX = 21
-FORWARD_BACKWARD_PX = 0.5  # forward-backward check (Kalal 2010)
+PATCH_RETURN_PX = 0.5  # forward-backward check (Kalal 2010)
 PYRAMID_LEVELS = 1  # pyramid levels; patches are first warped by a homography and then match within a pixel or two
 
 
@@ -26,7 +26,7 @@ def align_patches(
     guess = tracked.reshape(-1, 1, 2)
     aligned, found = _flow(warped, gray, start, guess)
     back, found_back = _flow(gray, warped, aligned, start)
-    closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < FORWARD_BACKWARD_PX
+    closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < PATCH_RETURN_PX
     near = np.linalg.norm((aligned - guess).reshape(-1, 2), axis=1) < max_shift_px
     keep = np.flatnonzero(found & found_back & closed & near)
     return aligned.reshape(-1, 2)[keep], keep

@@ -9,12 +9,12 @@ import numpy as np
 from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.messages import Frame, Relocalization
 from terrafix.vision.covisibility import COARSE_FEATURES, COARSE_WIDTH_PX
-from terrafix.vision.feature_tracker import MAX_PAIRS, SIGMA_PX, Motion
+from terrafix.vision.feature_tracker import MAX_ODOMETRY_PAIRS, SIGMA_PX, Motion
 from terrafix.vision.features import Features, SiftMatcher
 from terrafix.vision.keyframe_database import KeyframeDatabase, StoredKeyframe
 from terrafix.vision.two_view import TwoView, TwoViewGeometry, select_spread
 
-CANDIDATES = 5  # that are verified: 3 ms each
+DATABASE_CANDIDATES = 5  # that are verified: 3 ms each
 INTERVAL_NS = 1_000_000_000  # between two searches: 50 ms of one core, 5 % of its time
 # Image widths of way, from which a keyframe of the same fragment is another visit to its ground. Shorter loops would be
 # a second odometry whose scale errors, which are those of the first, the estimator would take for independent.
@@ -110,7 +110,7 @@ class RelocalizationSearch:
     def _verified(self, view: _View) -> list[tuple[StoredKeyframe, TwoView]]:
         """The candidates whose ground ``view`` shows."""
         verified = list[tuple[StoredKeyframe, TwoView]]()
-        for keyframe in self.database.candidates(view.features, view.is_recent, CANDIDATES):
+        for keyframe in self.database.candidates(view.features, view.is_recent, DATABASE_CANDIDATES):
             two_view = self._geometry.verify(self._matcher.match(_unpacked(keyframe.features), view.features))
             if two_view is not None:
                 verified.append((keyframe, two_view))
@@ -127,7 +127,7 @@ class RelocalizationSearch:
         return float(moved) < SAME_VIEW_SHIFT * self._camera.width
 
     def _message(self, frame: Frame, view: _View, keyframe: StoredKeyframe, two_view: TwoView) -> Relocalization:
-        pick = select_spread(two_view.a_px, MAX_PAIRS, (self._camera.width, self._camera.height))
+        pick = select_spread(two_view.a_px, MAX_ODOMETRY_PAIRS, (self._camera.width, self._camera.height))
         pairs = np.hstack([self._camera.normalise(px[pick]) for px in (two_view.a_px, two_view.b_px)])
         return Relocalization(
             t_ns=frame.t_ns,
@@ -151,4 +151,4 @@ def _oldest(verified: list[tuple[StoredKeyframe, TwoView]]) -> tuple[StoredKeyfr
 
 
 def _unpacked(features: Features) -> Features:
-    return Features(features.xy_px, features.descriptors.astype(np.float32), features.angle_rad, features.size_px)
+    return Features(features.xy_px, features.descriptors.astype(np.float32), features.size_px)

@@ -17,7 +17,8 @@ THUMBNAIL_PX = 24  # side of the thumbnails that select the earlier image to com
 # Two images with a displacement below this in every quadrant are the same view. For a 90 degree lens over 360 px it is
 # 0.006 degrees; attitude control of multirotors, gimbals included, holds 0.01 to 0.02 (manufacturers' data sheets).
 MAX_SHIFT_PX = 0.025
-MIN_CORRELATION = 0.5  # unrelated images also have a displacement estimate near zero, but a correlation below 0.3
+# unrelated images also have a displacement estimate near zero, but a correlation below 0.3
+MIN_PICTURE_CORRELATION = 0.5
 MIN_GRADIENT = 0.5  # RMS, grey levels per pixel: a uniform image has no measurable displacement
 
 
@@ -72,7 +73,7 @@ def same_view(before: np.ndarray, now: np.ndarray) -> bool:
     if before.shape != now.shape:
         return False
     first, second = before.astype(np.float32), now.astype(np.float32)
-    if _correlation(first, second) < MIN_CORRELATION:
+    if _correlation(first, second) < MIN_PICTURE_CORRELATION:
         return False
     along_x, along_y = (
         cv2.Scharr(first, cv2.CV_32F, 1, 0, scale=1 / 32),

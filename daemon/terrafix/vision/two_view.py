@@ -17,20 +17,21 @@ from terrafix.vision.features import Matches
 RANSAC_PX = 2.5  # 0.4 m from 100 m; excludes points above the ground
 # Of that threshold, where a match counts nothing, and before that in the first steps: over relief there are several
 # homographies near by that a third of the matches leaves for the last bit, and from afar one is the best
-CUTOFF, WIDER = 1.25, (5.0, 5.0, 4.0, 3.2, 2.5, 2.0, 1.6)
-# Matches of a homography, at least; steps of its reweighted least squares with CUTOFF, at most, and the last one [px];
-# by how much the diagonal of their normal equations is larger, so that points on a line have a solution
-MIN_HOMOGRAPHY, MAX_STEPS, STEP_PX, RIDGE = 8, 20, 1e-4, 1e-9
+HOMOGRAPHY_CUTOFF, WIDER = 1.25, (5.0, 5.0, 4.0, 3.2, 2.5, 2.0, 1.6)
+# Matches of a homography, at least; steps of its reweighted least squares with HOMOGRAPHY_CUTOFF, at most, and the last
+# one [px]; by how much the diagonal of their normal equations is larger, so that points on a line have a solution
+MIN_HOMOGRAPHY, MAX_HOMOGRAPHY_STEPS, STEP_PX, HOMOGRAPHY_RIDGE = 8, 20, 1e-4, 1e-9
 MIN_SPREAD = 0.12  # inliers must span this fraction of image width and height, else the pose is not determined
 TWO_VIEW_MIN_INLIERS = 15  # by chance, 4 to 9 of 100 wrong matches agree
-MIN_INLIER_RATIO = 0.15
+TWO_VIEW_MIN_INLIER_RATIO = 0.15
 EPIPOLAR_PX = 1.5  # of a match from its epipolar line [spec: twice the 1-sigma of a feature, feature_tracker.py]
-MAX_ITERATIONS = 3000  # of the search for a motion [spec: five of 30 % right matches are drawn in 99.9 %]
+MAX_MOTION_DRAWS = 3000  # of the search for a motion [spec: five of 30 % right matches are drawn in 99.9 %]
 # Share of the matches on epipolar lines that one homography explains over ground without relief: there the essential
 # matrix has a second solution, and the homography is the better model. [measured: docs/decisions/040]
 PLANAR_SHARE = 0.75
 TILT_SIGMA_RAD = np.radians(12.0)  # of the ground below a camera, against its mount [spec: tilt of a vehicle in wind]
-LEVELS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)  # quantiles of the depth that are tried [spec: finds a layer of a sixth]
+# quantiles of the depth that are tried [spec: finds a layer of a sixth]
+DEPTH_QUANTILES = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)
 SHRINKING_PX = (12.0, 8.0, 5.0, 3.0, 2.0, 1.5, 1.5)  # scale of the robust weight by step [spec: down to EPIPOLAR_PX]
 
 
@@ -60,7 +61,7 @@ class TwoViewGeometry:
         return two_view if self.is_verified(two_view) else None
 
     def is_verified(self, two_view: TwoView) -> bool:
-        enough = len(two_view.a_px) >= max(TWO_VIEW_MIN_INLIERS, MIN_INLIER_RATIO * two_view.matches)
+        enough = len(two_view.a_px) >= max(TWO_VIEW_MIN_INLIERS, TWO_VIEW_MIN_INLIER_RATIO * two_view.matches)
         return enough and covers_image(two_view.a_px, self._size_px) and covers_image(two_view.b_px, self._size_px)
 
     def fit(self, matches: Matches) -> TwoView:
@@ -70,7 +71,7 @@ class TwoViewGeometry:
             return TwoView(a[:0], b[:0], len(matches), a[:0], b[:0])
         x, y = self._camera.normalise(a), self._camera.normalise(b)
         essential, mask = cv2.findEssentialMat(
-            x, y, np.eye(3), cv2.USAC_MAGSAC, 0.999, EPIPOLAR_PX / self._camera.fx, MAX_ITERATIONS
+            x, y, np.eye(3), cv2.USAC_MAGSAC, 0.999, EPIPOLAR_PX / self._camera.fx, MAX_MOTION_DRAWS
         )
         on_lines = np.zeros(len(a), bool) if mask is None else mask.ravel() > 0
         if on_lines.sum() < TWO_VIEW_MIN_INLIERS:  # points on a plane are on epipolar lines, too
@@ -94,7 +95,7 @@ class TwoViewGeometry:
         px = self._camera.fx * length  # displacement in the image by inverse depth
         aside = np.eye(3) - np.outer(self._down, self._down)
         best = np.zeros(len(x), bool)
-        for level in np.quantile(inverse_depth / np.maximum(x @ self._down, 0.1), LEVELS):
+        for level in np.quantile(inverse_depth / np.maximum(x @ self._down, 0.1), DEPTH_QUANTILES):
             plane = level * self._down
             prior = aside / max(TILT_SIGMA_RAD * abs(level), 1e-9) ** 2
             for scale_px in SHRINKING_PX:
@@ -131,12 +132,12 @@ def fit_homography(a: np.ndarray, b: np.ndarray, threshold_px: float) -> np.ndar
     local = np.array([[scale, 0.0, centre[0]], [0.0, scale, centre[1]], [0.0, 0.0, 1.0]])
     matrix, points = matrix @ local, np.column_stack([(a - centre) / scale, np.ones(len(a))])
     matrix = matrix / matrix[2, 2]
-    for share in (*WIDER, *[CUTOFF] * MAX_STEPS):
+    for share in (*WIDER, *[HOMOGRAPHY_CUTOFF] * MAX_HOMOGRAPHY_STEPS):
         step = _homography_step(matrix, points, b, share * threshold_px)
         if not np.isfinite(step).all():
             break
         matrix = matrix + step
-        if share == CUTOFF and float(np.abs(step).max()) < STEP_PX:
+        if share == HOMOGRAPHY_CUTOFF and float(np.abs(step).max()) < STEP_PX:
             break
     return np.asarray(matrix @ np.linalg.inv(local))
 
@@ -158,7 +159,7 @@ def _homography_step(matrix: np.ndarray, points: np.ndarray, b: np.ndarray, cuto
         normal[6:, rows] = normal[rows, 6:].T
     square = np.einsum("ni,ni->n", to, to)
     normal[6:, 6:] = (weighted[:, :2] * square[:, None]).T @ points[:, :2]
-    normal[range(8), range(8)] *= 1.0 + RIDGE
+    normal[range(8), range(8)] *= 1.0 + HOMOGRAPHY_RIDGE
     weighted = weighted * mapped[:, 2:]
     along = np.einsum("ni,ni->n", to, off)
     right = np.concatenate([*(weighted.T @ off).T, -(weighted[:, :2].T @ along)])

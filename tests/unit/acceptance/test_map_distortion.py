@@ -9,7 +9,8 @@ import pytest
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import MapMatch, MapPose, Verdict
 from terrafix_lab.accept.measuring.map_distortion import left_by_local_model, mean_px, residuals, shows_distortion
-from terrafix_lab.accept.measuring.measures import map_px
+from terrafix_lab.accept.measuring.measures import MAP_FLOOR_PX, map_px
+from terrafix_lab.accept.measuring.results import Verdict as RowVerdict
 
 DOWN, HEIGHT_M, FOCAL_PX = np.diag([1.0, -1.0, -1.0]), 100.0, 700.0
 
@@ -72,3 +73,17 @@ def test_the_map_error_is_judged_by_one_rule_also_where_that_gives_the_larger_nu
     measured = map_px(evidence)
     assert left > whole * 1.02
     assert measured.value == pytest.approx(left if less_distortion else whole, rel=1e-6)
+
+
+@pytest.mark.parametrize(("noise_m", "verdict"), [(0.05, RowVerdict.NOT_MEASURABLE), (3.0, None)])
+def test_few_matches_of_a_warped_map_decide_only_what_its_distortion_cannot_change(
+    noise_m: float, verdict: RowVerdict | None
+) -> None:
+    """Three frames over a map whose distortion is above the floor: without it the matches are good, or bad as well."""
+    matches = [match(i, warped=True, noise_m=noise_m) for i in range(3)]
+    evidence: Any = SimpleNamespace(
+        frames=[SimpleNamespace(match=one, fixed=True) for one in matches],
+        origin=SimpleNamespace(camera=SimpleNamespace(fx=FOCAL_PX)),
+    )
+    measured = map_px(evidence)
+    assert measured.value is not None and measured.value > MAP_FLOOR_PX and measured.verdict is verdict

@@ -9,7 +9,7 @@ import pytest
 from flight_records import ORIGIN, live_messages, write_record, write_truth
 from terrafix.core.errors import EvaluationError
 from terrafix_tools.estimates import COLUMNS, Row, write_rows
-from terrafix_tools.evaluate import evaluate, offset_m, read_truth
+from terrafix_tools.evaluate import WORDS, evaluate, offset_m, read_truth
 
 CONTRACT = [
     "frames",
@@ -164,7 +164,7 @@ def test_the_columns_of_estimates_csv_are_as_specified() -> None:
     assert ",".join(COLUMNS) == (
         "file,t_s,lat_deg,lon_deg,alt_amsl_m,agl_m,sigma_e_m,sigma_n_m,cov_en_m2,yaw_deg,source_label,anchor_age_ms,"
         "covariance_mode,process_ms,refined_lat_deg,refined_lon_deg,refined_alt_amsl_m,refined_q_w_c,refined_cov,"
-        "refined_m_per_unit,refined_fragment_id"
+        "refined_m_per_unit,refined_fragment_id,frame_uid"
     )
 
 
@@ -175,3 +175,12 @@ def test_the_record_of_a_live_run_is_evaluated_without_estimates_csv(tmp_path: P
     assert (result["frames"], result["localised"]) == (20, 19)
     assert result["median_m"] == pytest.approx(math.hypot(1.0, 2.0), abs=0.01)
     assert json.loads((tmp_path / "evaluation.json").read_text()) == result
+
+
+def test_the_table_has_words_for_every_metric_and_no_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = folder(tmp_path, [row(0, 1.0), row(1, 30.0)])
+    result = evaluate(flight, flight / "truth.csv")
+    shown = capsys.readouterr().out
+    shown_keys = {key for key in result if not key.startswith("refined_") and key not in ("frames", "localised")}
+    assert shown_keys <= set(WORDS)
+    assert "frames within 5 m" in shown and "median error" in shown and "within_5m" not in shown

@@ -179,3 +179,12 @@ def test_the_times_of_a_live_record_are_those_since_its_origin(tmp_path: Path) -
     record.close()
     ((from_s, to_s),) = verdict_of(tmp_path).spans
     assert from_s == pytest.approx(0.0) and 5.0 < to_s < 20.0
+
+
+def test_pictures_that_were_not_used_are_named_with_their_span_and_leave_the_trust_to_the_claims() -> None:
+    frozen = [(20.0, fault("picture frozen")), (35.0, fault("picture frozen", active=False))]
+    verdict = flight_verdict(rows(), frozen)
+    assert verdict.label == "trust it" and verdict.text() == "Trust it (picture frozen from 20.0 s to 35.0 s)."
+    assert verdict.since(5.0).as_json()["refused_s"] == [[15.0, 30.0, "picture frozen"]]
+    open_end = flight_verdict(rows(), frozen[:1])
+    assert open_end.refused == ((20.0, 59.0, "picture frozen"),) and not open_end.active_faults

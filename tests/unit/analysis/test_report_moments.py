@@ -46,12 +46,24 @@ def test_a_peak_is_not_led_up_to_by_a_worse_candidate_nearby() -> None:
 
 def test_the_largest_radii_are_moments_at_least_ten_seconds_apart() -> None:
     sigmas = [1.0] * 400
-    for at, sigma in ((50, 8.0), (56, 7.0), (200, 9.0), (300, 3.0)):
+    for at, sigma in ((50, 80.0), (56, 70.0), (200, 90.0), (300, 30.0)):
         sigmas[at] = sigma
     moments = worst_moments(flight(sigmas))
-    assert [moment.t_s for moment in moments[:4]] == [0.0, 50.0, 200.0, 300.0]
-    assert moments[1].reasons == {"accuracy": "Stated 95 % radius 19.6 m"}
-    assert (moments[2].row, moments[2].frame_id) == (200, 200)
+    assert [moment.t_s for moment in moments] == [50.0, 200.0]  # 73 m at 300 s is a fix, which the autopilot gets
+    assert moments[0].reasons == {"accuracy": "Stated 95 % radius 195.8 m"}
+    assert (moments[1].row, moments[1].frame_id) == (200, 200)
+
+
+def test_a_flight_in_which_nothing_was_bad_has_no_worst_moment() -> None:
+    view = flight([2.0] * 400)
+    truth = Truth(48.0, 11.0)
+    view.compared = {r.file: Compared(r, truth, 0.0, 0.0, 5.0, None, None) for r in view.rows}
+    view.innovations = {"map": Innovations()}
+    view.innovations["map"].take(verdict(333, 5.0))
+    assert worst_moments(view, trusted=True) == []
+    assert [moment.t_s for moment in worst_moments(view)] == [333.0]
+    view.compared["100.jpg"] = Compared(view.rows[100], truth, 0.0, 0.0, 7.0, None, None)  # 3.5 sigma
+    assert [moment.t_s for moment in worst_moments(view, trusted=True)] == [100.0]
 
 
 def test_the_kinds_take_turns_and_neighbours_become_reasons() -> None:
@@ -71,7 +83,6 @@ def test_the_kinds_take_turns_and_neighbours_become_reasons() -> None:
         "GPS_INPUT without a 3D fix for 30.0 s: no estimate yet",
         "Height/focal seems x2.00 off: no fix: measured (at 1:42)",
         "No GPS_INPUT for 1.0 s (at 1:30)",
-        "Stated 95 % radius 4.9 m (at 1:30)",
     ]
     assert not any("for 0.0 s" in reason for reasons in moments.values() for reason in reasons)
     assert moments[250.0][0] == "Process vision died: signal 9"
@@ -80,9 +91,9 @@ def test_the_kinds_take_turns_and_neighbours_become_reasons() -> None:
 
 
 def test_there_are_ten_moments_at_most_in_order_of_time() -> None:
-    view = flight([2.0 + (t % 40 == 20) * (1.0 + t / 1000) for t in range(1000)])
+    view = flight([2.0 + (t % 40 == 20) * (100.0 + t / 1000) for t in range(1000)])
     truth = Truth(48.0, 11.0)
-    error_m = {500.0: 30.0, 420.0: 20.0, 265.0: 10.0, 170.0: 5.0, 130.0: 4.0}
+    error_m = {501.0: 30.0, 420.0: 20.0, 265.0: 10.0, 170.0: 5.0, 130.0: 4.0}
     view.compared = {r.file: Compared(r, truth, 0.0, 0.0, error_m.get(r.t_s, 0.1), None, None) for r in view.rows}
     view.innovations = {"map": Innovations()}
     view.innovations["map"].take(verdict(333, 5.0))
@@ -90,7 +101,7 @@ def test_there_are_ten_moments_at_most_in_order_of_time() -> None:
     assert len(moments) == 10
     assert [moment.t_s for moment in moments] == sorted(moment.t_s for moment in moments)
     by_time = {moment.t_s: moment for moment in moments}
-    assert by_time[500.0].reasons["error"] == "Error 30.0 m against the truth, stated 95 % radius 8.6 m"
+    assert by_time[501.0].reasons["error"] == "Error 30.0 m against the truth, stated 95 % radius 4.9 m"
     assert 980.0 in by_time and 20.0 not in by_time  # the largest radius, and one of the smaller ones
 
 

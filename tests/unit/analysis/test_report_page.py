@@ -89,7 +89,7 @@ def test_the_report_has_calibration_faults_and_the_verdict(tmp_path: Path) -> No
     text = page_of(tmp_path).text
     assert "Height/focal seems x2.00 off: no fix: stated against measured." in text
     assert (
-        "Verdict: Trust it from 8.0 s (0016.jpg) to 9.5 s (0019.jpg), and no more than that "
+        "Trust it from 8.0 s (0016.jpg) to 9.5 s (0019.jpg), and no more than that "
         "(height/focal seems x2.00 off)." in text
     )
 

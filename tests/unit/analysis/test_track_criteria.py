@@ -1,5 +1,7 @@
 """Criteria over a track of claims and truth, which acceptance, Monte Carlo and the fault matrix share."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,3 +47,13 @@ def test_several_flights_are_shown_as_the_worst_and_one_that_never_is_right_agai
 def test_the_time_to_notice_ends_at_the_last_false_position_after_the_beginning() -> None:
     assert track({5: 90.0, 13: 90.0}, fault=FAULT).notice_s() == pytest.approx(3.0)
     assert track({5: 90.0}, fault=FAULT).notice_s() is None and track({5: 90.0}).notice_s() is None
+
+
+def test_a_fault_is_told_by_its_cause_and_named_by_the_verdict() -> None:
+    told = [(9.0, "picture frozen"), (12.0, "3D fix"), (14.0, "picture frozen: not used")]
+    found = replace(track({15: 25.0, 17: 25.0}, fault=FAULT), told=told, cause="picture frozen")
+    assert measured([found])["told"] == "4 s" and found.verdict_s() == float("inf")
+    named = replace(found, refused=[Span(8.0, 16.0, "picture frozen")], untrusted=[Span(16.0, 18.0, "no position")])
+    assert measured([named])["in the verdict"] == "0 s" and measured([named])["trusted and wrong"] == "1"
+    other = replace(named, cause="upside down")
+    assert other.told_s() == other.verdict_s() == float("inf") and replace(named, cause="").told_s() is None

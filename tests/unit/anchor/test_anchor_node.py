@@ -21,7 +21,7 @@ from terrafix.anchor.verification.lock_monitor import LockMonitor
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pose import PoseFit, world_to_tangent
-from terrafix.map.null_model import DEFAULT_NULL, VERSION, NullModel
+from terrafix.map.null_model import DEFAULT_NULL, SCORE_VERSION, NullModel
 from terrafix.messages import (
     Health,
     MapMatch,
@@ -222,7 +222,7 @@ def test_the_required_evidence_follows_the_null_model_of_the_map_at_this_height(
         table="imagery",
         ce90_m=None,
         ce90_origin=None,
-        null_model=NullModel(version=VERSION, matcher="gradient", rows=rows),
+        null_model=NullModel(version=SCORE_VERSION, matcher="gradient", rows=rows),
         is_drawn=False,
     )
     for manifest in (SingleMapPackage.manifest, SimpleNamespace(layers=(layer,))):

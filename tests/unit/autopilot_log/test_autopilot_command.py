@@ -24,6 +24,7 @@ from autopilot_logs import (
 from flight_records import live_messages, write_record
 from terrafix.core.errors import EvaluationError, SourceError
 from terrafix_tools.cli import app
+from terrafix_tools.installation import install_command
 
 FLOWN = flight(seed=1)  # 20 to 140 s of the log
 RECORD_S = np.arange(18.0, 136.0, 0.2)  # times of the record at which a position was sent
@@ -170,4 +171,4 @@ def test_without_pyulog_one_line_states_what_to_install(tmp_path: Path) -> None:
         [sys.executable, "-c", code, "log", "info", str(tmp_path / "a.ulg")], capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 2
-    assert done.stderr == "terrafix: this command needs pyulog; install it: pip install 'terrafix[ground]'\n"
+    assert done.stderr == f"terrafix: this command needs pyulog; install it: {install_command('ground')}\n"

@@ -278,6 +278,9 @@ class HeldInTheAir:
 
     def check(self) -> None: ...
 
+    def texts(self) -> list[tuple[float, str]]:
+        return [(time.monotonic(), "picture frozen")]
+
     def fixes(self) -> list[ReceivedFix]:
         count = round(10.0 * (time.monotonic() - self.began_s))
         return [ReceivedFix(self.began_s + 0.1 * k, 2.0, 1.5) for k in range(count)]
@@ -290,9 +293,10 @@ def test_a_cell_hands_each_part_of_a_fault_to_its_own_and_takes_it_back(
 ) -> None:
     monkeypatch.setattr(run, "STEADY_S", 0.6)
     rig, fault = HeldInTheAir(), replace(FAULTS[name], lasts_s=0.3)
-    outcome = run._fly(rig, fault, Phase.CRUISE, 0.5)  # type: ignore[arg-type]
+    outcome, track = run._fly(rig, fault, Phase.CRUISE, 0.5)  # type: ignore[arg-type]
     assert (hit, "edited") in rig.edits and [e for e in rig.edits if e[1] == "edited"] == [(hit, "edited")]
     assert rig.edits[-2:] == [("camera", "true"), ("telemetry", "true")]
+    assert track.told and outcome.texts[0].endswith(" s: picture frozen")
     assert outcome.fixes > 90 and outcome.wrong == 0 and outcome.back_s == 0.0
     assert outcome.criteria["late sure over 20 m"] == "0" and outcome.criteria["right again"].endswith("s")
 

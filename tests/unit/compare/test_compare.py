@@ -47,7 +47,7 @@ def test_equal_records_are_equal_whatever_the_order_of_types_and_the_clock_of_pu
     by_type = sorted(others, key=lambda message: type(message).__name__ != "Origin")
     found = compared(tmp_path, messages, by_type)
     assert found["equal"] and found["compared"] == len(messages) and found["first"] is None
-    assert next(summary(found)) == f"equal: all {len(messages)} messages"
+    assert f"equal: all {len(messages)} messages" in list(summary(found))
 
 
 def test_the_first_differing_message_is_named_with_its_frame_time_and_field(tmp_path: Path) -> None:
@@ -126,6 +126,34 @@ def test_numbers_of_verdicts_and_delays_are_compared(tmp_path: Path) -> None:
     assert "delay of an estimate in B: p50 50.0 ms, p95 50.0 ms, p99 50.0 ms" in lines
 
 
+def test_distance_and_the_first_verdict_that_changed_come_first(tmp_path: Path) -> None:
+    messages = live_messages()
+    others = [
+        msgspec.structs.replace(message, verdict=m.Verdict.STALE)
+        if isinstance(message, m.MeasurementVerdict) and message.frame_id in (6, 8)
+        else message
+        for message in messages
+    ]
+    lines = list(summary(compared(tmp_path, messages, others)))
+    assert lines[0].startswith("positions: 19 of 19 frames equal")
+    assert lines[1] == "first verdict that changed: map of frame 6 at 3.000 s: accepted -> stale"
+
+
+def test_a_replay_is_not_asked_for_what_only_a_live_flight_has(tmp_path: Path) -> None:
+    messages = live_messages()
+    replayed = [x for x in messages if isinstance(x, m.Origin | m.Frame | m.NavEstimate | m.MeasurementVerdict)]
+    found = compared(tmp_path, messages, replayed)
+    assert found["equal"] and {"GpsInput", "Health", "ProcessEvent"} <= set(found["only_live"])
+    assert "not compared, because a replay has none: Dropped, GpsInput" in "\n".join(summary(found))
+
+
+def test_what_was_before_the_start_is_said_so_and_not_at_a_negative_time(tmp_path: Path) -> None:
+    early = m.ProcessEvent(t_ns=-2_500_000_000, process="link", event="started", detail="")
+    found = compared(tmp_path, live_messages(), [*live_messages(), early])
+    text = "\n".join(summary(found))
+    assert "ProcessEvent 2.500 s before the start: only in B" in text and "-2" not in text
+
+
 def test_records_with_other_clocks_are_compared_by_the_time_since_their_start(tmp_path: Path) -> None:
     def later(message: m.Message) -> m.Message:
         return msgspec.structs.replace(message, t_ns=message.t_ns + 7_000_000_000)
@@ -182,7 +210,8 @@ def test_the_command_writes_text_json_and_a_page_and_its_exit_code_says_whether_
     b = record(tmp_path / "b", changed(messages, 9, alt_amsl_m=601.5))
     runner, page = CliRunner(), tmp_path / "page.html"
     same = runner.invoke(app, ["compare", str(a), str(a)])
-    assert (same.exit_code, same.output.splitlines()[0]) == (0, f"equal: all {len(messages)} messages")
+    assert same.exit_code == 0 and same.output.startswith("positions: 19 of 19 frames equal")
+    assert same.output.splitlines()[1] == f"equal: all {len(messages)} messages"
     other = runner.invoke(app, ["compare", str(a), str(b), "--html", str(page)])
     assert other.exit_code == 1 and "alt_amsl_m 600.0 -> 601.5" in other.output
     as_json = runner.invoke(app, ["compare", str(a), str(b), "--json"])

@@ -27,6 +27,7 @@ from terrafix_tools.console.store import flights
 
 pytestmark = pytest.mark.real_time
 WAIT_S = 30.0
+SAID = m.SourceFacts(t_ns=0, facts=(m.Fact("clock", "by arrival"),))
 
 
 @pytest.fixture
@@ -60,6 +61,7 @@ class LiveProcesses:
                 for name, kind in {"vision": m.Frame, "anchor": m.MapMatch, "estimator": m.NavEstimate}.items()
             }
             publishers[m.SearchPlaces] = publishers[m.MapMatch]
+            publishers[m.Frame].publish(SAID)
             before_s, i = time.monotonic(), 0
             while not self._stop.wait(0.02):
                 located = estimate(i, 1.0 * i, 0.0)
@@ -110,7 +112,9 @@ def test_a_live_flight_has_results_events_health_and_an_end(
         names = [name for _, name, _ in console.events(flight_id, 0, 6)]
         assert set(names) <= {"frame_processed", "health"} and "frame_processed" in names
         soon(lambda: console.send("GET", "/health").json["live"])
-        assert console.send("GET", "/health").json["live"]["position"]["source"] == "satellite_anchored"
+        live = console.send("GET", "/health").json["live"]
+        assert live["position"]["source"] == "satellite_anchored"
+        assert live["source"] == [{"topic": "clock", "text": "by arrival"}]  # said before
         result = console.send("GET", f"/flights/{flight_id}/results?limit=1").json["results"][0]
         assert (result["match"], result["gps"]["lat"]) == ("accepted", pytest.approx(48.0, abs=1e-3))
         for path in ("images/batch", "complete"):

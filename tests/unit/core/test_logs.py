@@ -33,14 +33,14 @@ class BlockedStream(io.StringIO):
 def test_a_blocked_log_reader_loses_lines_without_blocking_the_process() -> None:
     stream = BlockedStream()
     writer = logs.configure("INFO", "link", stream)
-    for i in range(logs.QUEUE_LENGTH + 500):
+    for i in range(logs.LOG_QUEUE_LENGTH + 500):
         logs.get().info(f"line {i}")
     stream.unblock.set()
     writer.close()
     lines = [json.loads(text) for text in stream.getvalue().splitlines()]
     lost = [line["count"] for line in lines if line["event"] == "log lines lost"]
     written = [line for line in lines if line["event"].startswith("line ")]
-    assert sum(lost) + len(written) == logs.QUEUE_LENGTH + 500
+    assert sum(lost) + len(written) == logs.LOG_QUEUE_LENGTH + 500
     assert 498 <= sum(lost) <= 500
 
 
@@ -54,8 +54,11 @@ def test_an_event_that_repeats_is_limited_and_the_next_line_counts_what_was_left
         except structlog.DropEvent:
             return None
 
-    lines = [passed("no image") for _ in range(logs.BURST + 7)]
-    assert lines[: logs.BURST] == [{"event": "no image"}] * logs.BURST and lines[logs.BURST :] == [None] * 7
+    lines = [passed("no image") for _ in range(logs.EVENT_BURST + 7)]
+    assert (
+        lines[: logs.EVENT_BURST] == [{"event": "no image"}] * logs.EVENT_BURST
+        and lines[logs.EVENT_BURST :] == [None] * 7
+    )
     assert passed("camera lost") == {"event": "camera lost"}, "events are limited one by one"
     now[0] = logs.BURST_NS
     assert passed("no image") == {"event": "no image", "suppressed": 7}
@@ -78,12 +81,12 @@ def test_the_record_counts_every_line_that_the_limit_leaves_out_also_when_no_fur
     for _ in range(25):
         logs.get().error("camera lost", todo="nothing")
     written = list(logs.take_lines())
-    assert [line["event"] for line in written] == ["camera lost"] * logs.BURST
+    assert [line["event"] for line in written] == ["camera lost"] * logs.EVENT_BURST
     (count,) = logs.take_lines(last=True)
     writer.close()
     assert (count["event"], count["level"], count["fields"]) == (
         "camera lost",
         "error",
-        {"suppressed": 25 - logs.BURST},
+        {"suppressed": 25 - logs.EVENT_BURST},
     )
     assert list(logs.take_lines(last=True)) == []

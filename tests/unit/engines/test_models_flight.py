@@ -12,7 +12,7 @@ from map_matches import position_of
 from single_map_place import ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, PatchFix
-from terrafix.anchor.model_monitor import MAX_FAILURES
+from terrafix.anchor.model_monitor import MAX_MODEL_FAILURES
 from terrafix.anchor.node import AnchorNode, make_node
 from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.relocalization.relocalizer import LOST_SIGMA_M
@@ -110,7 +110,7 @@ def test_a_failed_inference_loses_one_frame_only(flight: ModelFlight) -> None:
 
 @pytest.mark.usefixtures("no_gradient_pose")
 def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(flight: ModelFlight) -> None:
-    for _ in range(MAX_FAILURES):
+    for _ in range(MAX_MODEL_FAILURES):
         match, events = flight.frame(flight.blue)
     assert match.verdict is Verdict.MODEL_FAILED
     assert [e.change for e in events] == [ModelChange.FAILED, ModelChange.GIVEN_UP]
@@ -121,7 +121,7 @@ def test_a_model_that_always_fails_is_abandoned_and_the_flight_continues(flight:
 
 @pytest.mark.usefixtures("no_gradient_pose")
 def test_only_consecutive_failures_count(flight: ModelFlight) -> None:
-    for image in [*[flight.blue] * (MAX_FAILURES - 1), flight.seen, *[flight.blue] * (MAX_FAILURES - 1)]:
+    for image in [*[flight.blue] * (MAX_MODEL_FAILURES - 1), flight.seen, *[flight.blue] * (MAX_MODEL_FAILURES - 1)]:
         match, _ = flight.frame(image)
     assert match.matcher == "xfeat"
     match, events = flight.frame(flight.blue)
@@ -156,7 +156,7 @@ def test_a_failing_model_during_a_search_leaves_the_search_state_unchanged(
 
     monkeypatch.setattr(MapSearch, "process_frame", broken)
     flight = ModelFlight(tmp_path, ground, start_sigma_m=5000.0)
-    for _ in range(MAX_FAILURES):
+    for _ in range(MAX_MODEL_FAILURES):
         match, events = flight.frame(flight.seen, sigma_m=100.0)
         assert (match.verdict, match.search.sigma_m) == (Verdict.LOST, LOST_SIGMA_M)
     assert events[-1].change is ModelChange.GIVEN_UP

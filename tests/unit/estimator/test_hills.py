@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simulated_flight import ORIGIN, EstimatorRun, Flight, cov_of, error_m
-from terrafix.estimator.models.terrain_roughness import CANDIDATES, TerrainRoughness
+from terrafix.estimator.models.terrain_roughness import ROUGHNESS_CANDIDATES, TerrainRoughness
 from terrafix.messages import MapMatch
 
 FRAMES = 240
@@ -84,7 +84,7 @@ def walked(rise: float, metres: float, roughness: TerrainRoughness, seed: int) -
     return estimates
 
 
-@pytest.mark.parametrize("rise", CANDIDATES)
+@pytest.mark.parametrize("rise", ROUGHNESS_CANDIDATES)
 def test_the_roughness_estimate_converges_to_the_true_walk(rise: float) -> None:
     ends = [np.mean(walked(rise, 6000.0, TerrainRoughness(), seed)[-20:]) for seed in range(8)]
     assert 0.7 * rise < np.median(ends) < 2.5 * rise

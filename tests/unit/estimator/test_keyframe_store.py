@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 
 from terrafix.estimator.integrity.fragments import Fragment
-from terrafix.estimator.keyframe_store import MAX_KEYFRAMES, KeptKeyframe, KeyframeStore
+from terrafix.estimator.keyframe_store import MAX_STORED_KEYFRAMES, KeptKeyframe, KeyframeStore
 from terrafix.estimator.keyframe_view import KeyframeView
 
 
@@ -40,7 +40,7 @@ def test_the_oldest_are_dropped_and_the_memory_stays_what_it_was_at_the_start() 
     assert newest is not None
     assert same(newest, added[16])
     assert store.size_bytes == reserved == 5 * 392
-    assert KeyframeStore().size_bytes == MAX_KEYFRAMES * 392
+    assert KeyframeStore().size_bytes == MAX_STORED_KEYFRAMES * 392
 
 
 def test_after_clear_there_is_none_and_new_ones_are_kept() -> None:

@@ -8,7 +8,7 @@ import pytest
 from simulated_flight import ORIGIN, EstimatorRun, Flight
 from terrafix.estimator.factors.plane_two_view import LensNoise, plane_two_view_factor
 from terrafix.estimator.models.lens_prior import RADIAL_K1_SIGMA
-from terrafix.estimator.models.plane_motion import Ground
+from terrafix.estimator.models.plane_motion import Ground, MatchedRays
 from terrafix.estimator.state import CALIBRATION_SIZE, RADIAL_K1
 from terrafix.messages import MapMatch, Message, Odometry
 
@@ -30,7 +30,8 @@ def test_the_radial_coefficient_explains_residuals_that_no_motion_explains(turne
     in_pose = (points - pose.translation()) @ pose.rotation().matrix()
     k1 = 0.01
     pairs = np.hstack([distorted(seen, k1), distorted(in_pose[:, :2] / in_pose[:, 2:], k1)])
-    factor = plane_two_view_factor(0, 1, 2, keyframe, pose, pairs, 1e-4, Ground(100.0, 2.0, slope_sigma=0.01))
+    rays = MatchedRays(pairs, 1e-4, Ground(100.0, 2.0, slope_sigma=0.01))
+    factor = plane_two_view_factor(0, 1, 2, keyframe, pose, rays)
 
     def error(estimate: float) -> float:
         values, bias = gtsam.Values(), np.zeros(CALIBRATION_SIZE)
@@ -58,7 +59,8 @@ def test_pairs_with_a_lens_in_their_noise_say_nothing_of_focal_length_and_radial
 
     def error(k1: float, longer: float, lens: LensNoise | None) -> float:
         views = (distorted(xy, k1) * (1.0 + longer) for xy in (seen, in_pose[:, :2] / in_pose[:, 2:]))
-        factor = plane_two_view_factor(0, 1, 2, keyframe, pose, np.hstack([*views]), 1e-4, ground, lens=lens)
+        rays = MatchedRays(np.hstack([*views]), 1e-4, ground)
+        factor = plane_two_view_factor(0, 1, 2, keyframe, pose, rays, lens=lens)
         return float(factor.error(values))
 
     noise = LensNoise(0.1, 0.1)

@@ -112,7 +112,7 @@ def test_a_stale_estimate_gives_fix_type_1_then_silence_and_recovers_immediately
     published = fly(LinkNode(10.0), 0, 62 * S, feed)
     last_estimate = 9_500 * MS
     for g in gps_since(published, S):
-        assert g.fix_type == (3 if g.t_ns <= last_estimate + fix_type.MAX_AGE_NS or g.t_ns > 60 * S else 1)
+        assert g.fix_type == (3 if g.t_ns <= last_estimate + fix_type.MAX_PREDICTION_AGE_NS or g.t_ns > 60 * S else 1)
         assert g.fix_type == 3 or (g.lat_deg == g.lon_deg == 0.0 and "old" in g.no_fix_reason)
     quiet = [(a.t_ns, b.t_ns) for a, b in pairwise(gps(published)) if b.t_ns - a.t_ns > 200 * MS]
     assert len(quiet) == 1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from terrafix.link.output.realtime_priority import PRIORITY
+from terrafix.link.output.realtime_priority import REALTIME_PRIORITY
 
 UNIT = Path(__file__).resolve().parents[3] / "systemd" / "terrafix.service"
 
@@ -27,7 +27,7 @@ def test_systemd_analyze_verifies_the_unit() -> None:
 
 def test_the_unit_allows_the_real_time_priority_of_the_link() -> None:
     """sched(7): up to RLIMIT_RTPRIO no capability is needed. RestrictRealtime= would filter the system call."""
-    assert values_of("LimitRTPRIO") == [str(PRIORITY)]
+    assert values_of("LimitRTPRIO") == [str(REALTIME_PRIORITY)]
     assert values_of("AmbientCapabilities") == [""]
     assert values_of("RestrictRealtime") in ([], ["no"])
     assert values_of("SystemCallFilter")[0] == "@system-service", "sched_setscheduler is in @resources, a part of it"

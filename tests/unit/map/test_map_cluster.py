@@ -12,6 +12,7 @@ import pytest
 import map_rasters
 from map_cluster import local_cluster
 from terrafix.map.package import MapPackage
+from terrafix_tools.installation import install_command
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.package.dem import TILES_PER_WORKER, height_places
 
@@ -81,4 +82,4 @@ def test_without_dask_the_error_names_the_package_to_install(tmp_path: Path) -> 
     hidden[2] = "import sys; sys.modules['distributed'] = None; " + hidden[2]
     done = subprocess.run(hidden, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "terrafix: --scheduler needs distributed; install it: pip install 'terrafix[cluster]'\n"
+    assert done.stderr == f"terrafix: --scheduler needs distributed; install it: {install_command('cluster')}\n"

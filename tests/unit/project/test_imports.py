@@ -32,6 +32,7 @@ OWNERS = {
         "terrafix.link",
         "terrafix_lab.sim.autopilot",
         "terrafix.core.mavlink.tlog",
+        "terrafix_lab.sim.flights.folder",
         "terrafix_lab.sim.flights.log",
         "terrafix_lab.sim.sitl",
         "terrafix_tools.preflight",

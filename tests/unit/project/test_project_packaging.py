@@ -16,6 +16,7 @@ from packaging.utils import canonicalize_name
 
 import terrafix
 from terrafix.core.errors import MapError
+from terrafix_tools.installation import install_command
 
 ROOT = Path(__file__).resolve().parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -25,7 +26,15 @@ EXTRAS = {  # libraries, without our own distribution for the ground
     extra: {canonicalize_name(Requirement(r).name): Requirement(r) for r in requirements if GROUND["name"] not in r}
     for extra, requirements in PROJECT["optional-dependencies"].items()
 }
-WITHOUT_GROUND = {"vehicle", "gstreamer", "faiss", "dev", "docs", "nightly"}  # what a vehicle may have, and the checks
+WITHOUT_GROUND = {
+    "vehicle",
+    "gstreamer",
+    "faiss",
+    "rosbag",
+    "dev",
+    "docs",
+    "nightly",
+}  # what a vehicle may have, and the checks
 IMPORTED_AS = {
     "foxglove-schemas-protobuf": "foxglove_schemas_protobuf",
     "protobuf": "google",
@@ -38,12 +47,14 @@ IMPORTED_AS = {
     "faiss-cpu": "faiss",
     "systemd-python": "systemd",
     "pygobject": "gi",
+    "jsonschema-rs": "jsonschema_rs",
 }
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # used by scripts/check or the build
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
 SEARCH = ROOT / "daemon" / "terrafix" / "anchor" / "place_index" / "faiss_ivf.py"  # the only file that imports FAISS
 SERVICE = ROOT / "daemon" / "terrafix" / "runtime" / "systemd.py"  # the only file that imports systemd-python
 ULOG = ROOT / "daemon" / "terrafix" / "core" / "autopilot_log" / "ulog.py"  # the only file that imports pyulog
+BAGS = ROOT / "daemon" / "terrafix" / "vision" / "sources" / "bag_reader.py"  # the only file that imports rosbags
 OURS = {"terrafix", "terrafix_engines", "terrafix_tools", "terrafix_lab"}
 SOURCES = ("daemon", "engines", "tools")
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
@@ -51,12 +62,12 @@ LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 def imported(*folders: str, extras: bool = True) -> set[str]:
     """Top-level names of all third-party modules imported below the folders; with or without the code of the extras of
-    what flies: FAISS, systemd and pyulog."""
+    what flies: FAISS, systemd, pyulog and rosbags."""
     found: set[str] = set()
     for folder in folders:
         own = {path.stem for path in (ROOT / folder).rglob("*.py")}
         for path in (ROOT / folder).rglob("*.py"):
-            if not extras and path in (SEARCH, SERVICE, ULOG):
+            if not extras and path in (SEARCH, SERVICE, ULOG, BAGS):
                 continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Import):
@@ -80,12 +91,20 @@ def test_what_flies_starts_without_faiss() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_what_flies_starts_without_the_tests_that_gtsam_brings() -> None:
+    """systemd/install.sh takes pytest away from a vehicle."""
+    without = "import sys; sys.modules.update(dict.fromkeys(('pytest', '_pytest', 'pluggy', 'iniconfig')))"
+    code = f"{without}; import terrafix.estimator.node, terrafix.smoother.node"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert "uninstall --yes pytest pluggy iniconfig" in (ROOT / "systemd" / "install.sh").read_text(encoding="utf-8")
+
+
 @pytest.mark.slow
 def test_every_import_is_declared_and_every_dependency_is_imported() -> None:
     declared = modules(CORE) | modules(EXTRAS["ground"]) | modules(EXTRAS["sim"]) | modules(EXTRAS["cluster"])
     declared |= (modules(EXTRAS["train"]) - EXPORTER) | modules(EXTRAS["faiss"]) | modules(EXTRAS["fleet"])
     declared |= modules(EXTRAS["vehicle"])
-    declared |= modules(EXTRAS["console"])
+    declared |= modules(EXTRAS["console"]) | modules(EXTRAS["rosbag"])
     assert imported("daemon", "engines", "tools") == declared
     assert imported("tests") - declared <= modules(EXTRAS["dev"]) | modules(EXTRAS["nightly"])
     assert modules(EXTRAS["dev"]) <= imported("tests")
@@ -96,7 +115,18 @@ def test_every_dependency_has_a_version_range() -> None:
         *CORE.values(),
         *(
             one
-            for extra in ("ground", "sim", "cluster", "faiss", "fleet", "console", "vehicle", "gstreamer", "train")
+            for extra in (
+                "ground",
+                "sim",
+                "cluster",
+                "faiss",
+                "fleet",
+                "console",
+                "rosbag",
+                "vehicle",
+                "gstreamer",
+                "train",
+            )
             for one in EXTRAS[extra].values()
         ),
     ]:
@@ -168,7 +198,7 @@ def test_without_the_ground_extra_one_line_states_what_to_install(command: str) 
     code = "import sys; sys.modules['rasterio'] = None; from terrafix_tools.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "terrafix: this command needs rasterio; install it: pip install 'terrafix[ground]'\n"
+    assert done.stderr == f"terrafix: this command needs rasterio; install it: {install_command('ground')}\n"
 
 
 def test_without_gdal_a_map_package_is_enough_for_replay_run_and_report() -> None:
@@ -228,11 +258,11 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
     folders = {path.name for path in (unpacked / "terrafix_tools").iterdir()} | {
         path.name for path in unpacked.iterdir()
     }
-    assert not folders & {"terrafix_lab", "console", "fleet", "finalise", "compare", "locate", "parallel"}
+    assert not folders & {"terrafix_lab", "console", "export", "fleet", "finalise", "compare", "locate", "parallel"}
     assert not (unpacked / "terrafix_engines" / "train").exists()
     shown = in_wheel(unpacked, "--help")
     commands = [line.split()[1] for line in shown.stdout.splitlines() if re.match(r"│ [a-z]", line)]
-    at_it = "run status hint preflight camera source files models replay report evaluate log map"
+    at_it = "run status hint init config preflight camera source files models replay report evaluate log map"
     assert commands == at_it.split(), shown.stderr
     status = in_wheel(unpacked, "status", "--run", "nowhere")
     assert status.returncode == 2 and status.stderr.startswith("terrafix: nowhere: no such folder; omit --run")
@@ -251,7 +281,8 @@ def test_a_vehicle_gets_the_commands_used_at_it_and_neither_lab_nor_console(unpa
 def test_a_command_that_a_vehicle_does_not_have_says_what_to_install(unpacked: Path, words: str, extra: str) -> None:
     done = in_wheel(unpacked, *words.split())
     assert done.returncode == 2
-    assert done.stderr == f"terrafix: this command needs terrafix-ground; install it: pip install 'terrafix[{extra}]'\n"
+    pip = f"{sys.executable} -m pip install"
+    assert done.stderr == f"terrafix: this command needs terrafix-ground; install it: {pip} 'terrafix[{extra}]'\n"
 
 
 def test_a_geotiff_on_a_vehicle_is_one_line(unpacked: Path, tmp_path: Path) -> None:
@@ -259,7 +290,7 @@ def test_a_geotiff_on_a_vehicle_is_one_line(unpacked: Path, tmp_path: Path) -> N
     flight = ("--source", "/dev/video0", "--map", str(tmp_path / "map.tif"), "--out", str(tmp_path / "out"))
     done = in_wheel(unpacked, "run", *flight)
     assert done.returncode == MapError.exit_code
-    assert re.fullmatch(r"terrafix: \S+/map.tif: no map package .* pip install 'terrafix\[ground\]'\n", done.stderr)
+    assert re.fullmatch(r"terrafix: \S+/map.tif: no map package .* pip install .*\[ground\]'.*\n", done.stderr)
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[3]
 CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
-LINES = {"daemon": 39250, "engines": 1730, "tools": 61100, "tests": 65350}
-WORDS = 71450  # of all documents
+LINES = {"daemon": 40900, "engines": 1730, "tools": 64400, "tests": 68600}
+WORDS = 68400  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 

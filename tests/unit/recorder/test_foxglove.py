@@ -21,7 +21,7 @@ from flight_records import ORIGIN, PERIOD_NS, estimate, live_messages, origin, w
 from terrafix import messages as m
 from terrafix.core.log_lines import MessageLog
 from terrafix.recorder import foxglove
-from terrafix.recorder.foxglove import CHANNELS, FoxgloveMessages, LogLevel, Stamped
+from terrafix.recorder.foxglove import FOXGLOVE_CHANNELS, FoxgloveMessages, LogLevel, Stamped
 
 PUBLISHED = {message.DESCRIPTOR.full_name: message for message in (CompressedImage, LocationFix, Log, PoseInFrame)}
 JSON_TYPES = {
@@ -74,7 +74,7 @@ def check_schema(schema: dict[str, Any], published: Descriptor) -> None:
             assert (node.get("contentEncoding") == "base64") == (field.type == FieldDescriptor.TYPE_BYTES)
 
 
-@pytest.mark.parametrize("topic", CHANNELS)
+@pytest.mark.parametrize("topic", FOXGLOVE_CHANNELS)
 def test_schemas_are_those_that_are_published(topic: str) -> None:
     schema = json.loads(foxglove.schema_of(topic))
     assert schema["title"] == foxglove.schema_name(topic)

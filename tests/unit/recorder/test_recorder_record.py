@@ -22,12 +22,15 @@ from terrafix.core.errors import OutputError, SourceError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import Edge, NodeContext
 from terrafix.recorder.images import ImagePolicy
-from terrafix.recorder.node import QUEUE_LENGTH, RecorderEdge, make_edge
+from terrafix.recorder.node import RECORD_QUEUE_LENGTH, RecorderEdge, make_edge
 from terrafix.recorder.provenance import header
 from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images, read_thumbnails
 from terrafix.recorder.schema import MESSAGE_TYPES, schema_of, topic_of
 from terrafix.recorder.segments import MEGABYTE, SegmentRing
 from terrafix.recorder.writer import FlightWriter
+from terrafix_tools.log.edit import cut
+from terrafix_tools.report.data import FlightView
+from terrafix_tools.report.sections_run import provenance
 
 pytestmark = pytest.mark.real_time
 
@@ -85,6 +88,23 @@ def test_recorded_messages_are_read_back(tmp_path: Path) -> None:
     pictures = dict(read_thumbnails(tmp_path))
     assert len(pictures) == 20
     assert pictures[3].startswith(b"\xff\xd8")
+
+
+def test_every_segment_and_the_report_have_what_the_source_says(tmp_path: Path) -> None:
+    said = m.SourceFacts(t_ns=5, facts=(m.Fact("clock", "by arrival"), m.Fact("height", "not stated")))
+    ring = SegmentRing(tmp_path, header(Config()), budget_mb=100)
+    for message in (origin(), said):
+        ring.write(message, 5)
+    ring.write(estimate(1, 0.0, 0.0), 10**15)  # far later: the next one begins
+    ring.close()
+    for name in ("flight-000.mcap", "flight-001.mcap"):
+        result = ReadResult()
+        assert said in read(tmp_path / name, result)
+        assert result.header["source"] == [["clock", "by arrival"], ["height", "not stated"]]
+    assert cut(tmp_path, tmp_path / "cut.mcap", 1.0, 1e9) == 2
+    assert read(tmp_path / "cut.mcap").count(said) == 1
+    page = provenance(FlightView(title="", rows=[], frame_ids=[], header=result.header))
+    assert "source, clock" in page and "by arrival" in page
 
 
 def test_a_standard_mcap_reader_opens_the_record_with_json_schemas(tmp_path: Path) -> None:
@@ -199,7 +219,7 @@ def test_a_blocked_disk_does_not_block_the_recorder_and_losses_are_recorded(tmp_
     ring = BlockedRing(tmp_path)
     edge = RecorderEdge(ring, MemoryFrameStore(1), ImagePolicy(RecorderSection(frames="none")))
     began = time.monotonic()
-    for i in range(QUEUE_LENGTH + 500):
+    for i in range(RECORD_QUEUE_LENGTH + 500):
         edge.on_message(estimate(i, 0.0, 0.0))
     assert time.monotonic() - began < 2.0
     ring.unblock.set()
@@ -208,7 +228,7 @@ def test_a_blocked_disk_does_not_block_the_recorder_and_losses_are_recorded(tmp_
     lost = sum(x.count for x in messages if isinstance(x, m.Dropped))
     kept = sum(isinstance(x, m.NavEstimate) for x in messages)
     assert 490 <= lost <= 500
-    assert kept + lost == QUEUE_LENGTH + 500
+    assert kept + lost == RECORD_QUEUE_LENGTH + 500
 
 
 def test_frames_get_thumbnails_unless_their_pixels_are_gone(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from terrafix import messages as m
 from terrafix.core import logs
 from terrafix.core.node import Edge, Node
 from terrafix.processes import ALL_MESSAGES, Process
-from terrafix.runtime.bus import QUEUE_LENGTH, Publisher, Subscriber
+from terrafix.runtime.bus import BUS_QUEUE_LENGTH, Publisher, Subscriber
 from terrafix.runtime.executor import LiveShell
 from terrafix.runtime.progress_stamp import Progress
 from terrafix.runtime.run_dir import RunDir
@@ -138,7 +138,7 @@ def test_messages_lost_by_a_slow_subscriber_are_counted_and_publishing_does_not_
     publisher = bus.publisher("vision")
     slow = bus.subscriber("vision", m.Frame)
     collect(slow, publisher, lambda _: publisher.subscriptions(m.Frame) == 1)
-    total = 6 * QUEUE_LENGTH
+    total = 6 * BUS_QUEUE_LENGTH
     started = time.monotonic()
     for i in range(total):
         publisher.publish(frame(i))

@@ -182,7 +182,6 @@ def test_codec_round_trip_of_numbers_enums_and_none() -> None:
     estimate = prediction(3, 0.1 + 0.2, -0.0)
     for message in (estimate, verdict(1, "höhe"), ORIGIN, status(2**62)):
         assert codec.decode(codec.encode(message)) == message
-        assert codec.decode_json(codec.encode_json(message)) == message
 
 
 def test_codec_accepts_numpy_scalars_and_rejects_arrays_and_unknown_types() -> None:

@@ -15,11 +15,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 
 from runtime_nodes import TABLE
 from terrafix import messages as m
-from terrafix.core.codec import decode_json
 from terrafix.core.config import Config, SmootherSection
 from terrafix.core.errors import ConfigError, MapError, OutputError
 from terrafix.processes import PROCESSES
@@ -73,7 +73,11 @@ class SupervisedRun:
     def recorded(self) -> list[m.Message]:
         """The messages that the recorder has written so far, without a partial last line."""
         path = self.out_dir / "received.jsonl"
-        return [decode_json(line) for line in path.read_bytes().split(b"\n")[:-1]] if path.exists() else []
+        return (
+            [msgspec.json.decode(line, type=m.AnyMessage) for line in path.read_bytes().split(b"\n")[:-1]]
+            if path.exists()
+            else []
+        )
 
     def pid(self, process: str) -> int:
         started = [e for e in self.events if e.process == process and e.event in ("started", "restarted")]
@@ -300,7 +304,7 @@ def test_processes_of_a_killed_supervisor_fly_on_and_the_next_one_adopts_restart
     record = tmp_path / "out" / "received.jsonl"
 
     def adopted() -> list[str]:
-        events = (decode_json(line) for line in record.read_bytes().split(b"\n")[:-1])
+        events = (msgspec.json.decode(line, type=m.AnyMessage) for line in record.read_bytes().split(b"\n")[:-1])
         return [e.process for e in events if isinstance(e, m.ProcessEvent) and e.event == "adopted"]
 
     others = {run.path for run in run_dir.live_runs()}

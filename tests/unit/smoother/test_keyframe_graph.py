@@ -99,7 +99,7 @@ def test_a_frame_that_nothing_hangs_on_is_dropped_after_some_time() -> None:
 
 
 def test_frames_are_bounded_and_the_oldest_that_are_no_keyframes_go_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keyframe_graph, "MAX_FRAMES", 40)
+    monkeypatch.setattr(keyframe_graph, "MAX_SMOOTHED_FRAMES", 40)
     graph = KeyframeGraph()
     graph.add_start(node(0))
     for i in range(1, 100):

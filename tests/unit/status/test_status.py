@@ -9,6 +9,7 @@ from flight_records import estimate, gps_input
 from terrafix.messages import (
     Dropped,
     EkfStatus,
+    Fact,
     Frame,
     GnssState,
     GnssVerdict,
@@ -20,6 +21,7 @@ from terrafix.messages import (
     ProcessEvent,
     SearchState,
     SearchStep,
+    SourceFacts,
     StatusText,
     ThermalBand,
     ThermalReading,
@@ -67,6 +69,12 @@ def test_a_3d_fix_has_its_accuracy_position_and_source() -> None:
     assert position["radius_95_m"] == 9.8  # 4 m times the square root of 5.991
     assert position["source"] == "satellite_anchored" and position["agl_m"] == 100.0 and position["speed_mps"] == 10.0
     assert "3D fix, accuracy 5.0 m" in text_of(found) and "map match" in text_of(found)
+
+
+def test_what_the_source_says_of_itself_is_a_fact() -> None:
+    said = SourceFacts(t_ns=0, facts=(Fact("clock", "by arrival"),))
+    assert after(1.0, (0.5, said))["source"] == [{"topic": "clock", "text": "by arrival"}]
+    assert after(1.0)["source"] is None
 
 
 def test_without_a_fix_the_reason_is_that_of_gps_input() -> None:

@@ -15,14 +15,12 @@ from typer.testing import CliRunner, Result
 
 import map_rasters
 from map_packages import centre_of
-from preflight_autopilot import GroundAutopilot
 from terrafix.core.config import Config, HealthSection, LinkSection, Models, RecorderSection, SourceSection
 from terrafix.core.config import Map as MapSection
 from terrafix.core.errors import LinkError, UsageError
 from terrafix.core.signature import generate
 from terrafix.link.gnss.previous_source import PreviousSource, PreviousSourceFile
 from terrafix.link.mavlink.transport import Address, Chunk
-from terrafix_lab.sim.autopilot.parameters import FIRMWARE
 from terrafix_tools.cli import app
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
@@ -34,30 +32,12 @@ from terrafix_tools.preflight.lines import CheckStatus, Line, number
 from terrafix_tools.preflight.parameter_check import check_parameters, parameter_names, proposed_changes
 from terrafix_tools.preflight.rules import ALWAYS, GPS_INPUT_RULES, LOCAL_RULES, Context
 from terrafix_tools.preflight.run import _parameter_lines, _vehicle_lines, preflight
+from terrafix_tools.preflight.simulated import GROUND_DEFAULTS as DEFAULTS
+from terrafix_tools.preflight.simulated import GroundAutopilot
 
 ROOT = Path(__file__).resolve().parents[3]
 VEHICLES = ROOT / "config" / "vehicles"
 PAGE = ROOT / "docs" / "autopilot.md"
-# Defaults of ArduPilot 4.6 (read from its firmware in software in the loop)
-DEFAULTS = FIRMWARE | {
-    "AHRS_EKF_TYPE": 3,
-    "EK3_ENABLE": 1,
-    "EK3_GLITCH_RAD": 25,
-    "EK3_POSNE_M_NSE": 0.5,
-    "EK3_POS_I_GATE": 500,
-    "EK3_SRC_OPTIONS": 1,
-    "EK3_SRC1_YAW": 1,
-    "EK3_VELNE_M_NSE": 0.5,
-    "EK3_VEL_I_GATE": 500,
-    "FS_EKF_ACTION": 1,
-    "FS_EKF_THRESH": 0.8,
-    **{f"GPS{n}_POS_{axis}": 0 for n in (1, 2) for axis in "XYZ"},
-    "GPS_HDOP_GOOD": 140,
-    "SERIAL1_PROTOCOL": 2,
-    "SERIAL1_BAUD": 57,
-    "VISO_DELAY_MS": 10,
-    "VISO_TYPE": 0,
-}
 
 
 @pytest.fixture(autouse=True)
@@ -342,7 +322,7 @@ class Streaming(GroundAutopilot):
             for _ in range(int(each * self.now_s) - int(each * before_s)):
                 kind = mavlink.mavlink_map[message_id]
                 lengths = (kind.array_lengths[place] for place in kind.orders)
-                self._send(kind(*([0] * n if n else 0 for n in lengths)))
+                self.send(kind(*([0] * n if n else 0 for n in lengths)))
         return super().read()
 
 

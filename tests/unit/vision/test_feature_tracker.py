@@ -10,7 +10,7 @@ from terrafix.core.camera import CameraCalibration
 from terrafix.core.limits import WINDOW_NODES
 from terrafix.messages import Verdict
 from terrafix.vision import covisibility
-from terrafix.vision.feature_tracker import MAX_FAILURES, MAX_PAIRS, FrameTracker, Motion
+from terrafix.vision.feature_tracker import MAX_ODOMETRY_PAIRS, MAX_TRACK_FAILURES, FrameTracker, Motion
 from terrafix_lab.sim.true_messages import apply, homography
 from textured_ground import PINHOLE, rotation, texture, view
 
@@ -65,7 +65,7 @@ def test_tracking_recovers_the_motion(ground: np.ndarray, name: str) -> None:
     assert (start.keyframe_id, start.becomes_keyframe, len(start.two_view)) == (4, True, 0)
     motion = tracker.track(5, picture(ground, second))
     assert (motion.verdict, motion.keyframe_id) == (Verdict.ACCEPTED, 4)
-    assert 15 <= len(motion.two_view) <= MAX_PAIRS and motion.inliers >= len(motion.two_view)
+    assert 15 <= len(motion.two_view) <= MAX_ODOMETRY_PAIRS and motion.inliers >= len(motion.two_view)
     assert is_right(motion, first, second)
     spread = np.ptp(motion.two_view[:, :2], axis=0) * PINHOLE.fx
     assert spread[0] > 0.3 * PINHOLE.width  # matches cover the overlap, not one roof
@@ -128,7 +128,7 @@ def test_a_new_fragment_has_no_matches_with_earlier_keyframes(ground: np.ndarray
     tracker = FrameTracker(PINHOLE)
     for i in range(6):
         tracker.track(i, picture(ground, pose(9.0 * i, 0.0)))
-    for i in range(MAX_FAILURES + 1):
+    for i in range(MAX_TRACK_FAILURES + 1):
         tracker.track(6 + i, foreign())
     assert len(tracker.track(20, foreign()).three_view) == 0
 
@@ -175,9 +175,9 @@ def test_after_foreign_frames_without_matches_tracking_returns_to_the_previous_k
     tracker = FrameTracker(PINHOLE)
     for i in range(4):
         tracker.track(i, picture(ground, pose(0.0, 4.0 * i)))
-    alone = [tracker.track(4 + i, foreign(40 + i)) for i in range(MAX_FAILURES)]
-    assert alone[-1].verdict is Verdict.ACCEPTED and alone[-1].keyframe_id == 3 + MAX_FAILURES
-    back = tracker.track(4 + MAX_FAILURES, picture(ground, pose(0.0, 16.0)))
+    alone = [tracker.track(4 + i, foreign(40 + i)) for i in range(MAX_TRACK_FAILURES)]
+    assert alone[-1].verdict is Verdict.ACCEPTED and alone[-1].keyframe_id == 3 + MAX_TRACK_FAILURES
+    back = tracker.track(4 + MAX_TRACK_FAILURES, picture(ground, pose(0.0, 16.0)))
     assert back.verdict is Verdict.ACCEPTED and back.keyframe_id < 4
 
 
@@ -205,7 +205,7 @@ def test_uniform_frames_from_the_start_are_not_registered(ground: np.ndarray) ->
     tracker = FrameTracker(PINHOLE)
     for i in range(3):
         assert len(tracker.track(i, blank).two_view) == 0
-    found = [tracker.track(3 + i, picture(ground, pose(0.0, 9.0 * i))) for i in range(MAX_FAILURES + 3)]
+    found = [tracker.track(3 + i, picture(ground, pose(0.0, 9.0 * i))) for i in range(MAX_TRACK_FAILURES + 3)]
     assert found[-1].verdict is Verdict.ACCEPTED and len(found[-1].two_view) > 0
 
 
@@ -213,18 +213,18 @@ def test_repeated_registration_failures_start_a_new_fragment() -> None:
     """Frames without matches: the last one starts a fragment, and later frames refer to it."""
     tracker = FrameTracker(PINHOLE)
     tracker.track(0, foreign(20))
-    motions = [tracker.track(1 + i, foreign(21 + i)) for i in range(MAX_FAILURES)]
-    assert [m.verdict for m in motions[:-1]] == [Verdict.FEW_INLIERS] * (MAX_FAILURES - 1)
+    motions = [tracker.track(1 + i, foreign(21 + i)) for i in range(MAX_TRACK_FAILURES)]
+    assert [m.verdict for m in motions[:-1]] == [Verdict.FEW_INLIERS] * (MAX_TRACK_FAILURES - 1)
     last = motions[-1]
     assert (last.verdict, last.keyframe_id, last.becomes_keyframe, len(last.two_view)) == (
         Verdict.ACCEPTED,
-        MAX_FAILURES,
+        MAX_TRACK_FAILURES,
         True,
         0,
     )
-    place = texture(21 + MAX_FAILURES - 1, 190.0)
-    again = tracker.track(MAX_FAILURES + 1, picture(place, pose(0.0, 6.0)))
-    assert (again.verdict, again.keyframe_id) == (Verdict.ACCEPTED, MAX_FAILURES)
+    place = texture(21 + MAX_TRACK_FAILURES - 1, 190.0)
+    again = tracker.track(MAX_TRACK_FAILURES + 1, picture(place, pose(0.0, 6.0)))
+    assert (again.verdict, again.keyframe_id) == (Verdict.ACCEPTED, MAX_TRACK_FAILURES)
 
 
 def test_two_failed_frames_that_match_each_other_start_a_new_fragment(ground: np.ndarray) -> None:
@@ -291,7 +291,7 @@ def test_a_photo_is_registered_to_the_line_beside_it_that_was_flown_before(groun
             assert link.keyframe_id < i and link.keyframe_id != motion.keyframe_id
             seen = replace(motion, two_view=link.two_view)
             assert is_right(seen, shots[link.keyframe_id][0], shots[i][0])
-            assert 15 <= len(link.two_view) <= MAX_PAIRS and link.inliers >= len(link.two_view)
+            assert 15 <= len(link.two_view) <= MAX_ODOMETRY_PAIRS and link.inliers >= len(link.two_view)
             assert link.sigma_norm >= 0.75 / PINHOLE.fx
     assert sum(len(m.links) for m in motions) >= 3
 

@@ -76,7 +76,7 @@ def test_the_memory_is_reserved_at_the_start_and_stays_the_same(places: list[Fea
         held |= {newest.features.descriptors.ctypes.data, newest.histogram.ctypes.data}
         assert len(database) == min(i + 1, 6)
     assert len(held) == 2 * 7, "arrays lie in the same seven places, one of them for the newest before one is removed"
-    assert database.size_bytes == reserved == 7 * (300 * (2 * 4 + 128 + 4 + 4) + 512 * 4)
+    assert database.size_bytes == reserved == 7 * (300 * (2 * 4 + 128 + 4) + 512 * 4)
 
 
 def test_keyframes_that_stay_keep_their_features_when_others_are_removed(places: list[Features]) -> None:

@@ -254,6 +254,20 @@ def test_a_stated_accuracy_of_the_tilt_replaces_that_of_photos(tmp_path: Path) -
     assert open_source(str(tmp_path)).origin().attitude_sigma_deg == 2.0
 
 
+@pytest.mark.parametrize(("apart_deg", "sigma_deg"), [(0.0, 5.0), (29.0, 5.0), (47.0, 47.0), (-170.0, 170.0)])
+def test_a_gimbal_yaw_far_from_that_of_the_flight_widens_the_heading(
+    apart_deg: float, sigma_deg: float, tmp_path: Path
+) -> None:
+    for i, yaw_deg in enumerate((-175.0, 30.0, 100.0)):
+        turned = {"GimbalYawDegree": f"{yaw_deg}", "FlightYawDegree": f"{math.remainder(yaw_deg + apart_deg, 360):.1f}"}
+        photo(tmp_path / f"{i}.jpg", dji(**CALIBRATED, **{**NADIR, **turned}), at_s=i)
+    source = open_source(str(tmp_path))
+    assert source.origin().yaw_sigma_deg == pytest.approx(sigma_deg)
+    (state,) = next(iter(source.shots())).states
+    assert state.yaw_rad == pytest.approx(math.radians(-175.0))
+    assert any("degrees apart in half of the photos" in f.text for f in facts_of(source)) == (sigma_deg > 5.0)
+
+
 @pytest.mark.parametrize(
     ("xmp", "unknown"),
     [

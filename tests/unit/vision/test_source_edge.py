@@ -14,10 +14,21 @@ from terrafix.core.config import Config, HealthSection, SourceSection
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
-from terrafix.messages import OVERTAKEN, Frame, Health, Message, Origin, SourceEnded, ThermalBand, VehicleState
+from terrafix.messages import (
+    OVERTAKEN,
+    Frame,
+    Health,
+    Message,
+    Origin,
+    SourceEnded,
+    SourceFacts,
+    ThermalBand,
+    VehicleState,
+)
 from terrafix.vision.edge import SourceEdge, make_edge
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_source
+from terrafix.vision.sources.facts import facts_of
 
 pytestmark = pytest.mark.real_time
 
@@ -79,6 +90,15 @@ def test_a_recording_plays_in_real_time(tmp_path: Path, listen: Listen) -> None:
     assert [s.t_ns for s in states] == [f.t_ns for f in listener.frames]
     assert listener.messages[-1].frames == 4  # type: ignore[attr-defined]
     assert list(listener.edge.poll(now_ns())) == []  # the end is published once
+
+
+def test_what_the_source_says_of_itself_is_published_after_its_origin(tmp_path: Path, listen: Listen) -> None:
+    source = open_source(str(flight(tmp_path / "f", 4)))
+    listener = listen(source)
+    listener.until(lambda: len(listener.messages) > 1)
+    origin, said = listener.messages[:2]
+    assert isinstance(said, SourceFacts) and said.t_ns == origin.t_ns
+    assert said.facts == tuple(facts_of(source)) and {"camera", "rate"} <= {fact.topic for fact in said.facts}
 
 
 def test_a_restart_resumes_at_the_current_flight_time(tmp_path: Path, listen: Listen) -> None:
@@ -167,7 +187,7 @@ def test_make_edge_reads_the_configuration(tmp_path: Path) -> None:
     folder = str(flight(tmp_path / "f"))
     edge = make_edge(context(path=folder, start="10,20"))
     assert edge is not None
-    (origin,) = edge.poll(now_ns())
+    origin, _ = edge.poll(now_ns())
     edge.close()
     assert isinstance(origin, Origin) and (origin.lat_deg, origin.lon_deg) == (10.0, 20.0)
     with pytest.raises(UsageError):

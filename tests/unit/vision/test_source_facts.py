@@ -12,8 +12,9 @@ from typer.testing import CliRunner
 from source_folders import TOML, flight
 from terrafix.core.config import load
 from terrafix.core.errors import MapError, SourceError, UsageError
+from terrafix.messages import Fact
 from terrafix.vision.sources import open_configured, open_source
-from terrafix.vision.sources.facts import Fact, facts_of
+from terrafix.vision.sources.facts import facts_of
 from terrafix_tools import cli
 from terrafix_tools.replay import replay
 

@@ -33,8 +33,7 @@ def matched(points_m: np.ndarray, r: np.ndarray, at_m: np.ndarray, wrong: int = 
     a, b = (xy + rng.normal(0.0, NOISE_PX, xy.shape) for xy in (a, b))
     chance = [rng.uniform((0, 0), (720, 405), (wrong, 2)) for _ in range(2)]
     a, b = np.vstack([a, chance[0]]).astype(np.float32), np.vstack([b, chance[1]]).astype(np.float32)
-    zero = np.zeros(len(a), np.float32)
-    return Matches(a, b, zero, zero)
+    return Matches(a, b)
 
 
 def ground_points(count: int, mount_deg: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -98,9 +97,9 @@ def test_images_from_one_place_have_a_motion(r: np.ndarray) -> None:
 def test_wrong_matches_have_no_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, b = (rng.uniform((0, 0), (720, 405), (90, 2)).astype(np.float32) for _ in range(2))
-    geometry, zero = TwoViewGeometry(CAMERA), np.zeros(90, np.float32)
-    assert geometry.verify(Matches(a, b, zero, zero)) is None
-    assert len(geometry.fit(Matches(a, b, zero, zero)).a_px) < TWO_VIEW_MIN_INLIERS
+    geometry = TwoViewGeometry(CAMERA)
+    assert geometry.verify(Matches(a, b)) is None
+    assert len(geometry.fit(Matches(a, b)).a_px) < TWO_VIEW_MIN_INLIERS
 
 
 def test_matches_in_a_corner_of_the_image_determine_no_motion() -> None:
@@ -123,7 +122,7 @@ def test_each_feature_is_in_one_pair_at_most() -> None:
 def test_coarse_features_are_the_strongest_large_ones_in_pixels_of_the_smaller_image() -> None:
     xy = np.arange(20.0).reshape(10, 2).astype(np.float32)
     size = np.array([2.0, 4.0] * 5, np.float32)
-    features = Features(xy, np.zeros((10, 128), np.float32), np.zeros(10, np.float32), size)
+    features = Features(xy, np.zeros((10, 128), np.float32), size)
     coarse = features.coarse(0.5, 3)
     assert coarse.size_px.tolist() == [2.0, 2.0, 2.0]
     assert np.allclose(coarse.xy_px, (xy[[1, 3, 5]] + 0.5) * 0.5 - 0.5)

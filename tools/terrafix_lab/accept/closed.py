@@ -11,8 +11,7 @@ import numpy as np
 from terrafix.core.config import Config, LinkSection
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
-from terrafix.link.integrity.fix_type import FIX_3D
-from terrafix.messages import Frame, GpsInput
+from terrafix.messages import FIX_3D, Frame, GpsInput
 from terrafix.recorder.reader import read_flight
 from terrafix.vision.sources import Shot
 from terrafix_lab.accept.false_inputs.scenarios import LIES_IN_THE_LOOP

@@ -25,6 +25,7 @@ from terrafix_lab.accept.scenarios import BY_NAME, COMMAND, SCENARIOS
 from terrafix_lab.accept.table import Acceptance, conclude
 from terrafix_lab.faults.fault import check_flown_by
 from terrafix_lab.faults.table import FAULTS
+from terrafix_tools.progress import LineProgress, waiting
 
 JOB, GROUND_JOB, CRASH = "job.json", "ground.json", "crash.txt"
 QUICK_FRAMES = 120
@@ -77,7 +78,7 @@ def accept(options: AcceptOptions) -> Acceptance:
             results[scenario] = done
             del jobs[scenario]
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
+    with LineProgress(*columns, console=console) as progress:
         task = progress.add_task("scenarios", total=len(chosen), completed=len(results))
         for result in _fly_all(jobs, options.workers, progress, task):
             results[result.scenario] = result
@@ -210,7 +211,7 @@ def _ground(options: AcceptOptions, kind: str, frames: int, console: Console) ->
         mark.unlink()
     from terrafix_lab.accept.generated import make  # not needed for a given flight
 
-    with console.status(f"ground and flight: {kind}, {frames} frames"):
+    with waiting(console, f"ground and flight: {kind}, {frames} frames"):
         make(kind, folder, seed=options.seed, frames=frames)
     mark.write_bytes(msgspec.json.encode(GroundJob(kind, options.seed, frames)))
     return folder

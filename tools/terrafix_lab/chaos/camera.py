@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import chain, islice
 
 import cv2
 import numpy as np
@@ -33,8 +34,10 @@ class StreamedCamera:
 
         Images exist at multiples of 1 / ``frame_hz``: each is sent at its own time, and stamped with it."""
         self.edit: Edit = unchanged
+        self.past_s = 0.0  # of the time before it that an edit sees; set it first
         self.pushed_s: list[float] = []  # monotonic time of each image
-        self._stream, self._image_at, self._flight_s = stream, image_at, flight_s
+        self.image_at = image_at  # may be changed at any time
+        self._stream, self._flight_s = stream, flight_s
         self._frame_hz, self._wait_s = frame_hz, 0.0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="chaos-camera", daemon=True)
@@ -51,13 +54,19 @@ class StreamedCamera:
         while not self._stopping.is_set():
             edit = self.edit
             jpegs = _Jpegs(decoded=edit is not unchanged)
-            before_ns = 0
-            for shot in edit(self._shots(edit, jpegs)):
+            before_ns, past = 0, self._past(jpegs)
+            for shot in islice(edit(chain(past, self._shots(edit, jpegs))), len(past), None):
                 if shot.frame.t_ns == before_ns:  # another one of the same time
                     self._stopping.wait(REPEATED_AFTER / self._frame_hz)
                 before_ns = shot.frame.t_ns
                 self._stream.push_jpeg(jpegs.of(shot), shot.frame.t_ns)
                 self.pushed_s.append(time.monotonic())
+
+    def _past(self, jpegs: "_Jpegs") -> list[Shot]:
+        """Those of ``past_s`` before now; the edit gives one for each."""
+        now_ns, flight_s = time.monotonic_ns(), self._flight_s()
+        ago_s = [count / self._frame_hz for count in range(round(self.past_s * self._frame_hz), 0, -1)]
+        return [jpegs.shot(self.image_at(flight_s - s), now_ns - round(1e9 * s)) for s in ago_s]
 
     def _shots(self, edit: Edit, jpegs: "_Jpegs") -> Iterator[Shot]:
         """Each when its time has come, until there is another edit."""
@@ -68,7 +77,7 @@ class StreamedCamera:
             now_ns, flight_s = time.monotonic_ns(), self._flight_s()
             late_s = flight_s - math.floor(flight_s * self._frame_hz + SLACK) / self._frame_hz
             t_ns = now_ns - round(1e9 * late_s)
-            yield jpegs.shot(self._image_at(flight_s - late_s), t_ns)
+            yield jpegs.shot(self.image_at(flight_s - late_s), t_ns)
             spent_s = (time.monotonic_ns() - now_ns) / 1e9
             self._wait_s = max(0.0, 1.0 / self._frame_hz - spent_s - late_s)
 

@@ -1,5 +1,6 @@
 """The command `terrafix chaos`."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -24,8 +25,8 @@ def chaos(
     ] = None,
     map_path: Annotated[Path | None, typer.Option("--map", help="Its map; default: the one that it names.")] = None,
     vehicle: Annotated[
-        Kind, typer.Option(help="Of the generated flight: copter from ground to ground, or plane in the air.")
-    ] = Kind.COPTER,
+        Kind | None, typer.Option(help="Of a generated flight in the air; default: a copter from ground to ground.")
+    ] = None,
     again: Annotated[bool, typer.Option("--again", help="Also fly cells that have a result.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the place and of the noise.")] = 1,
     model: Annotated[
@@ -38,19 +39,16 @@ def chaos(
 
     Results are kept in OUT/results.json; a matrix that was interrupted goes on. Exit code 1: a promise is broken, or a
     cell had no fix before its fault."""
+    from terrafix_lab.chaos.deck import deck_in
     from terrafix_lab.chaos.recorded_scene import recorded_scene
     from terrafix_lab.chaos.run import Results, fly_matrix
-    from terrafix_lab.chaos.scene import scene_in
+    from terrafix_lab.chaos.scene import ChaosScene, scene_in
     from terrafix_lab.chaos.table import line, write_table
-    from terrafix_lab.faults.fault import Phase, check_flown_by
+    from terrafix_lab.faults.fault import Need, Phase, check_flown_by
     from terrafix_lab.faults.table import FAULTS, MATRIX
 
     faults = [f for f in FAULTS.values() if any(f.name.startswith(name) for name in fault)] if fault else [*MATRIX]
-    phases = [
-        p
-        for p in Phase
-        if (not phase or p.value in phase) and not ((flight or vehicle is Kind.PLANE) and p is Phase.LANDING)
-    ]
+    phases = [p for p in Phase if (not phase or p.value in phase) and not ((flight or vehicle) and p is Phase.LANDING)]
     if not faults or not phases:
         raise UsageError("no such fault or phase; 'terrafix chaos --list' names them")
     if list_only:
@@ -67,16 +65,27 @@ def chaos(
         return
     for chosen in faults:
         check_flown_by("terrafix chaos --fault", chosen)
+    on_deck, elsewhere = (any(need in f.needs for f in faults) for need in (Need.DECK, Need.ELSEWHERE))
+    if on_deck and (vehicle or flight or any(Need.DECK not in f.needs for f in faults)):
+        raise UsageError("a start on a deck is a flight of its own, of a copter; give it as the only --fault")
+    if elsewhere and flight is not None:
+        raise UsageError("pictures of another place are those of a generated flight; omit --flight")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
     results = Results(out / "results.json")
-    scene = (
-        scene_in(out / (f"flight-{seed}" if vehicle is Kind.COPTER else f"{vehicle}-{seed}"), seed, vehicle)
-        if flight is None
-        else recorded_scene(flight, map_path, out)
-    )
+    scene: ChaosScene
+    if on_deck:
+        scene = deck_in(out / f"deck-{seed}", seed)
+        phases = [p for p in phases if p in scene.at_s]
+    elif flight is not None:
+        scene = recorded_scene(flight, map_path, out)
+    else:
+        name = vehicle or "flight"
+        scene = scene_in(out / f"{name}-{seed}", seed, vehicle)
+        if elsewhere:
+            scene = replace(scene, elsewhere=scene_in(out / f"{name}-{seed + 1}", seed + 1, vehicle).jpeg)
     cells = [(f, p) for p in phases for f in faults if again or not results.has(f, p)]
     for outcome in fly_matrix(scene, cells, out, results, seed=seed, model=model or _fetched_model()):
         typer.echo(line(outcome))

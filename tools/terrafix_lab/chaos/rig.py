@@ -63,7 +63,9 @@ class Rig:
         self.out.mkdir()
         self.map_path.write_bytes(scene.map_path.read_bytes())
         self.set_temperature(COOL_MC)
-        self.peer: AutopilotPeer = AutopilotPeer(seed=seed, kind=scene.kind, home_amsl_m=self._home_amsl_m())
+        self.peer: AutopilotPeer = AutopilotPeer(
+            seed=seed, kind=scene.kind, home_amsl_m=self._home_amsl_m(), aligned=not scene.disarmed
+        )
         self.stream = FrameStream()
         self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s, scene.frame_hz)
         self.switches = Switches(folder / "switches")

@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -21,7 +22,8 @@ from terrafix_lab.chaos.verdict import Outcome
 from terrafix_lab.faults.edits import EVER, Span, unchanged, unchanged_origin
 from terrafix_lab.faults.fault import ROOT, Fault, Need, Phase, Process
 from terrafix_lab.faults.pictures import black
-from terrafix_lab.track import measured
+from terrafix_lab.track import Track, measured
+from terrafix_tools.flight_verdict import FlightVerdict, verdict_of
 from terrafix_tools.score import longest_gap_s
 
 DISK_MB = 24  # of a disk of its own
@@ -43,7 +45,7 @@ def fly_cell(scene: ChaosScene, fault: Fault, phase: Phase, folder: Path, *, see
     rig = Rig(
         scene,
         folder,
-        scene.at_s[phase] - lead_s,
+        scene.begin_s(phase, WHOLE_S if fault.lasts_s is None else fault.lasts_s) - lead_s,
         seed=seed,
         needs=fault.needs,
         model=model,
@@ -53,8 +55,8 @@ def fly_cell(scene: ChaosScene, fault: Fault, phase: Phase, folder: Path, *, see
         if Need.DISK in fault.needs:
             _mount_disk(rig.out)
         with rig:
-            outcome = _fly(rig, fault, phase, lead_s)
-        outcome = _with_record(rig, fault, phase, outcome)
+            outcome, track = _fly(rig, fault, phase, lead_s)
+        outcome = _with_record(rig, fault, phase, outcome, track)
     finally:
         if Need.DISK in fault.needs:
             subprocess.run(["umount", "-l", str(rig.out)], check=False, capture_output=True)
@@ -79,7 +81,7 @@ def _mount_disk(out: Path) -> None:
         raise OutputError(f"{out}: no disk could be mounted there ({done.stderr.strip()})")
 
 
-def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
+def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> tuple[Outcome, Track]:
     rig.take_off()
     assert rig.began_s is not None
     fault_s = rig.began_s + lead_s
@@ -95,20 +97,23 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
     lasts_s = WHOLE_S if fault.lasts_s is None else fault.lasts_s
     span = Span(fault_s, fault_s + lasts_s, fault.name)
     if fault.source is not None:
+        rig.camera.past_s = fault.past_s
         rig.camera.edit = fault.of_camera(span)
     rig.peer.edit_telemetry(fault.of_telemetry(span))
     process.begin(rig)
     _wait(rig, fault_s + lasts_s, lambda: process.during(rig, time.monotonic() - fault_s))
+    rig.camera.past_s = 0.0
     rig.camera.edit = unchanged
     rig.peer.edit_telemetry(unchanged)
     process.end(rig)
     ended_s = time.monotonic()
-    _wait_for_fix(rig, ended_s)
+    _wait_for_fix(rig, ended_s, lambda: not fault.cause or _track(rig, span, fault).is_right_again)
     end_s = time.monotonic()
     fixes = rig.peer.fixes()
     times = [fix.received_s for fix in fixes]
     had_fix = phase is Phase.START or bool(before)
-    return Outcome(
+    track = _track(rig, span, fault)
+    outcome = Outcome(
         fault=fault.name,
         phase=phase,
         verdict="" if had_fix else judge.NO_FIX,
@@ -119,9 +124,18 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> Outcome:
         silence_s=longest_gap_s(rig.peer.received_s, fault_s, end_s),
         without_fix_s=judge.without_fix_s(times, fault_s, end_s),
         back_s=judge.back_s(times, ended_s, end_s),
-        criteria=measured([judge.track_of(fixes, span, rig.camera.pushed_s)]),
+        criteria=measured([track]),
+        texts=[f"{t_s - fault_s:.1f} s: {text}" for t_s, text in track.told],
+        fix_lost=judge.times_lost(times, fault_s, end_s),
         load=os.getloadavg()[0] / (os.cpu_count() or 1),
     )
+    return outcome, track
+
+
+def _track(rig: Rig, span: Span, fault: Fault) -> Track:
+    """So far. ``span``: of the fault."""
+    told = [(t_s, text) for t_s, text in rig.peer.texts() if t_s >= span.from_s]
+    return replace(judge.track_of(rig.peer.fixes(), span, rig.camera.pushed_s, fault.cause), told=told)
 
 
 def _wait_for_first_fix(rig: Rig) -> None:
@@ -131,15 +145,15 @@ def _wait_for_first_fix(rig: Rig) -> None:
         _wait(rig, time.monotonic() + 0.2)
 
 
-def _wait_for_fix(rig: Rig, ended_s: float) -> None:
-    """Until there were fixes for STEADY_S, at most RECOVERY_LIMIT_S."""
+def _wait_for_fix(rig: Rig, ended_s: float, is_right: Callable[[], bool]) -> None:
+    """Until there were fixes for STEADY_S and ``is_right``, at most RECOVERY_LIMIT_S."""
     until_s = ended_s + RECOVERY_LIMIT_S
     while time.monotonic() < until_s:
         _wait(rig, time.monotonic() + 0.2)
         now_s = time.monotonic()
         times = [fix.received_s for fix in rig.peer.fixes() if fix.received_s > ended_s]
         back_s = judge.back_s(times, ended_s, now_s)
-        if back_s is not None and now_s - (ended_s + back_s) > STEADY_S:
+        if back_s is not None and now_s - (ended_s + back_s) > STEADY_S and is_right():
             return
 
 
@@ -150,11 +164,24 @@ def _wait(rig: Rig, until_s: float, act: Callable[[], None] = lambda: None) -> N
         time.sleep(STEP_S)
 
 
-def _with_record(rig: Rig, fault: Fault, phase: Phase, outcome: Outcome) -> Outcome:
+def _with_record(rig: Rig, fault: Fault, phase: Phase, outcome: Outcome, track: Track) -> Outcome:
     """Completes an outcome after the stop."""
     recorded_s: list[float] = []
+    report: FlightVerdict | None = None
+    fault_s = 0.0 if track.fault is None else track.fault.from_s
     with suppress(SourceError) if _hits_record(fault) else nullcontext():  # it may lie on a disk that is gone
         recorded_s = [m.t_ns / 1e9 for _, _, m in read_flight(rig.out) if isinstance(m, GpsInput)]
+        report = verdict_of(rig.out, fault_s)
+    if report is not None:
+        spans = [Span(a + fault_s, b + fault_s, text) for a, b, text in report.untrusted]
+        named = [Span(a + fault_s, b + fault_s, text) for a, b, text in report.refused]
+        track = replace(track, untrusted=spans, refused=named)
+        outcome = msgspec.structs.replace(
+            outcome,
+            report=report.text(),
+            untrusted=[f"{a:.1f} to {b:.1f} s: {text}" for a, b, text in [*report.untrusted, *report.refused]],
+            criteria=measured([track]),
+        )
     outcome = msgspec.structs.replace(
         outcome,
         not_recorded_s=judge.not_recorded_s(rig.peer.received_s, recorded_s),

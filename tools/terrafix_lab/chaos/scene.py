@@ -1,7 +1,7 @@
 """The flight of the fault matrix: a copter over a generated place, from take-off to landing, with its phases."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from terrafix.messages import Camera
 from terrafix_lab.faults.fault import Phase
 from terrafix_lab.sim.autopilot.course import Course, PeerState, peer_state_of, read_course, write_course
 from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.flights.folder import AGL_M as FLIGHT_AGL_M
 from terrafix_lab.sim.flights.folder import CAMERA, FRAME_HZ, Flight
 from terrafix_lab.sim.flights.make import MAP_NAME, FlightOptions, make
 from terrafix_lab.sim.world import place as world
@@ -21,11 +22,12 @@ from terrafix_tools.mission.items import Do, Item, Mission
 AGL_M = 100.0
 LEG_M = 250.0  # of the two legs, east and then north
 WAY = ((LEG_M, 0.0), (LEG_M, LEG_M))
-PLANE_S = 150.0  # that a plane flies
+AIR_S = 150.0  # of a flight in the air
+AGL_OF = {Kind.COPTER: AGL_M, Kind.PLANE: FLIGHT_AGL_M}
 STEP_S = 0.1  # of the course
 CRUISE_SHARE = 0.95  # of the greatest height
 STRAIGHT_RADPS = 0.05  # a turn is faster
-AFTER_S = 25.0  # of a flight without a landing that must be left after a fault
+AFTER_S = 30.0  # of a flight without a landing that must be left after a fault
 LEAD_S = 12.0  # flown before the fault, for the first fixes
 COURSE = "course.csv"
 
@@ -45,6 +47,14 @@ class ChaosScene:
     truth_sigma_m: float = 0.0
     attitude_sigma_deg: float | None = None
     kind: Kind = Kind.COPTER
+    disarmed: bool = False  # at its beginning
+    elsewhere: Callable[[float], bytes] | None = None  # as ``jpeg``, of another place
+
+    def begin_s(self, phase: Phase, lasts_s: float) -> float:
+        """Second of the flight at which a fault begins, so early that a flight without a landing goes on after it."""
+        if Phase.LANDING in self.at_s or self.disarmed:
+            return self.at_s[phase]
+        return max(LEAD_S, min(self.at_s[phase], self.duration_s - lasts_s - AFTER_S))
 
     def jpeg(self, t_s: float) -> bytes:
         """The image whose exposure is nearest to a time of the flight."""
@@ -52,12 +62,13 @@ class ChaosScene:
         return self.jpegs[index].read_bytes()
 
 
-def scene_in(folder: Path, seed: int, kind: Kind = Kind.COPTER) -> ChaosScene:
-    """The flight in ``folder``, which is generated if it is not there: of a copter from ground to ground, or of a plane
-    in the air. Raises OutputError, SourceError."""
+def scene_in(folder: Path, seed: int, in_air: Kind | None = None) -> ChaosScene:
+    """The flight in ``folder``, which is generated if it is not there: of a copter from ground to ground, or of
+    ``in_air`` in the air. Raises OutputError, SourceError."""
+    kind = in_air or Kind.COPTER
     if not (folder / COURSE).exists():
-        wanted = FlightOptions(seed=seed, vehicle=kind, duration_s=PLANE_S)
-        if kind is Kind.COPTER:
+        wanted = FlightOptions(seed=seed, vehicle=kind, duration_s=AIR_S, agl_m=AGL_OF[kind])
+        if in_air is None:
             mission = folder.with_suffix(".waypoints")
             write_mission(mission, mission_along("two legs", seed, WAY))
             wanted = FlightOptions(seed=seed, mission=mission, vehicle=kind)
@@ -67,7 +78,7 @@ def scene_in(folder: Path, seed: int, kind: Kind = Kind.COPTER) -> ChaosScene:
     if not jpegs:
         raise SourceError(f"{folder}: has no images; remove it, and it is generated anew")
     duration_s = len(jpegs) / FRAME_HZ
-    at_s = phases(course, duration_s) if kind is Kind.COPTER else phases_in_the_air(course, duration_s)
+    at_s = phases(course, duration_s) if in_air is None else phases_in_the_air(course, duration_s)
     return ChaosScene(folder / MAP_NAME, jpegs, course, at_s, duration_s, kind=kind)
 
 

@@ -22,6 +22,7 @@ def line(outcome: Outcome) -> str:
     figures = {
         "silence": _s(outcome.silence_s),
         "without fix": _s(outcome.without_fix_s),
+        "lost": str(outcome.fix_lost),
         "back after": _s(outcome.back_s),
         "worst": f"{worst} sigma",
         "not recorded": _s(outcome.not_recorded_s),

@@ -34,25 +34,36 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     worst_error_m: float | None = None
     silence_s: float | None = None  # longest time without any GPS_INPUT from the beginning of the fault on
     without_fix_s: float | None = None  # sum of the times without a 3D fix from the beginning of the fault on
+    fix_lost: int = 0  # times that the 3D fix was lost from the beginning of the fault on
     back_s: float | None = None  # from the end of the fault to a lasting fix; None: not back, or none before
     not_recorded_s: float | None = None  # longest time of GPS_INPUT that the record lacks
     stop_s: float | None = None  # that the ordered stop took
+    texts: list[str] = []  # that the autopilot received from the beginning of the fault on, with seconds since then
+    report: str = ""  # the verdict of the report
+    untrusted: list[str] = []  # spans that it does not trust, in seconds since the beginning of the fault, with reason
     criteria: dict[str, str] = {}  # those of terrafix_lab/track.py
     load: float | None = None  # load average of the computer over its cores at the end
 
 
-def track_of(fixes: Sequence[ReceivedFix], fault: Span | None, frames_s: Sequence[float]) -> Track:
+def track_of(fixes: Sequence[ReceivedFix], fault: Span | None, frames_s: Sequence[float], cause: str = "") -> Track:
     """Of the 3D fixes; the claim is that of the worst axis. ``frames_s``: times of the images."""
     t_s, error_m, sigma_m = (
         np.array([(f.received_s, f.error_m, f.horizontal_m or NOTHING_M) for f in fixes]).reshape(-1, 3).T
     )
-    return Track(t_s, error_m, (error_m / sigma_m) ** 2, sigma_m, fault, frames_s)
+    return Track(t_s, error_m, (error_m / sigma_m) ** 2, sigma_m, fault, frames_s, cause=cause)
 
 
 def without_fix_s(fixes_s: Sequence[float], from_s: float, to_s: float) -> float:
+    return sum(_gaps_s(fixes_s, from_s, to_s))
+
+
+def times_lost(fixes_s: Sequence[float], from_s: float, to_s: float) -> int:
+    return len(_gaps_s(fixes_s, from_s, to_s))
+
+
+def _gaps_s(fixes_s: Sequence[float], from_s: float, to_s: float) -> list[float]:
     times = [from_s, *(t for t in fixes_s if from_s <= t <= to_s), to_s]
-    gaps = (b - a for a, b in itertools.pairwise(times))
-    return sum(gap for gap in gaps if gap > WITHOUT_FIX_S)
+    return [gap for a, b in itertools.pairwise(times) if (gap := b - a) > WITHOUT_FIX_S]
 
 
 def back_s(fixes_s: Sequence[float], ended_s: float, to_s: float) -> float | None:

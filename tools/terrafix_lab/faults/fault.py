@@ -40,6 +40,8 @@ class Need(StrEnum):
     SWITCHES = "the switches of switches.py"
     MODEL = "the weights of XFeat"
     CONSOLE = "a console that shows the flight"
+    DECK = "a start on a deck that moves"
+    ELSEWHERE = "pictures of another place"
     MEMORY_GROUP = "a control group of memory"
 
 
@@ -66,7 +68,9 @@ class Fault:
     """One row of the table. ``lasts_s`` None: from the first frame to the last. ``source``: the edit of frames in a
     span; ``telemetry``: of what the autopilot reports, one shot for each. ``origin``: an edit of start and camera, for
     the whole flight. ``matches``: makes an edit of the map matches. ``is_true``: no input is false, some are missing.
-    ``no_fix_in``: phases of the fault matrix in which no fix is expected after it."""
+    ``past_s``: of pictures before it, which its ``source`` shows.
+    ``cause``: regular expression for what texts to the pilot and the verdict of the report call it. ``no_fix_in``:
+    phases of the fault matrix in which no fix is expected after it."""
 
     name: str
     words: str = ""
@@ -78,6 +82,8 @@ class Fault:
     process: Process | None = None
     needs: frozenset[Need] = frozenset()
     is_true: bool = False
+    cause: str = ""
+    past_s: float = 0.0
     no_fix_in: frozenset[Phase] = frozenset({Phase.LANDING})  # it ends below the least height for matching
 
     def of_camera(self, span: Span) -> Edit:

@@ -18,6 +18,7 @@ FOREIGN_LAG_S = 25.0  # longer than the span of a lie in the closed loop: no pic
 EXPOSURE_GAIN, EXPOSURE_OFFSET = 6.0, 60.0  # of an overexposed image: all but the darkest ground is white
 DEFOCUS_PX = 12.0  # 1-sigma of the blur
 JITTER_PX = 0.4  # of a picture that stands still, as of an encoder
+WAVE_PX, WAVE_GREY, WATER_GREY = 3.0, 6.0, 70.0  # size and contrast of waves, 1-sigma; grey value of the water
 SEED = 1  # of noise
 
 
@@ -168,6 +169,23 @@ def zooming(span: Span, factor: float) -> Edit:
                 continue
             scale = 1.0 + share * (factor - 1.0)
             yield replace(shot, image=scaled(scale, scale)(shot.image))
+
+    return edit
+
+
+def water(span: Span) -> Edit:
+    """In ``span`` the camera sees open water: waves that are others in each picture, and nothing else."""
+
+    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
+        rng = np.random.default_rng([SEED, 75])
+        for shot in shots:
+            if shot.image is None or not span.has(shot.frame.t_ns / 1e9):
+                yield shot
+                continue
+            waves = cv2.GaussianBlur(rng.normal(0.0, 1.0, shot.image.shape[:2]), (0, 0), WAVE_PX)
+            grey = WATER_GREY + WAVE_GREY * waves / waves.std()
+            image = np.clip(grey, 0, 255).astype(np.uint8)
+            yield replace(shot, image=image if shot.image.ndim == 2 else cv2.merge([image] * 3))
 
     return edit
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 SUPERVISOR = "supervisor"
 SHORT_S, LONG_S = 6.0, 10.0
 STOPPED_SHARE = 0.8  # of the time, of a process that is slow
+SLOW_SHARE = 0.75  # of the time, that a computer lacks which is four times too slow
 PERIOD_S = 0.1  # of its interruptions
 COOL_MC, HOTTEST_MC = 40_000, 95_000  # of the simulated thermal zone
 SPARE_BYTES = 4 << 20  # that a process may still allocate
@@ -60,6 +61,21 @@ def slow(process: str) -> Fault:
 
     slowed = Process(during=during, end=lambda rig: rig.signal(process, signal.SIGCONT))
     return Fault(f"{process}: slow", lasts_s=LONG_S, process=slowed)
+
+
+def slow_all(rig: "Rig", elapsed_s: float) -> None:
+    """Each process of Terrafix runs a quarter of the time, as on a computer that is four times too slow."""
+    stops = elapsed_s % PERIOD_S < SLOW_SHARE * PERIOD_S
+    _signal_all(rig, signal.SIGSTOP if stops else signal.SIGCONT)
+
+
+def go_on_all(rig: "Rig") -> None:
+    _signal_all(rig, signal.SIGCONT)
+
+
+def _signal_all(rig: "Rig", number: signal.Signals) -> None:
+    for process in PROCESSES:
+        rig.signal(process.name, number)
 
 
 def limited(process: str, what: str, limit: int, used: Callable[[int], int]) -> Fault:
@@ -98,6 +114,19 @@ def leaking(process: str) -> Fault:
         rig.memory_group.lift()
 
     return act(f"{process}: leak", SHORT_S, begin, end, Need.SWITCHES, Need.MEMORY_GROUP)
+
+
+def show_another_place(rig: "Rig") -> None:
+    assert rig.scene.elsewhere is not None
+    rig.camera.image_at = rig.scene.elsewhere
+
+
+def show_own_place(rig: "Rig") -> None:
+    rig.camera.image_at = rig.scene.jpeg
+
+
+def set_doubled(rig: "Rig", *, after_s: float | None) -> None:
+    rig.peer.again_after_s = after_s
 
 
 def _mute(rig: "Rig", *, muted: bool) -> None:

@@ -8,13 +8,24 @@ from itertools import accumulate, pairwise
 from terrafix.core.errors import UsageError
 from terrafix_lab.faults import edits, pictures
 from terrafix_lab.faults.edits import Edit, Span, StateEdit, during
-from terrafix_lab.faults.fault import Fault, Need
+from terrafix_lab.faults.fault import Fault, Need, Process
 from terrafix_lab.faults.messages import outliers
-from terrafix_lab.faults.processes import AROUND_THEM, KILLED_AND_LIMITED, SHORT_S
+from terrafix_lab.faults.processes import (
+    AROUND_THEM,
+    KILLED_AND_LIMITED,
+    SHORT_S,
+    go_on_all,
+    set_doubled,
+    show_another_place,
+    show_own_place,
+    slow_all,
+)
 
 FROZEN_S, FORGED_S, LATE_S = 15.0, 10.0, 1.0
+FOREIGN_S, DECK_S, CLIMB_S = 10.0, 22.0, 45.0
 BUFFERS = 4
 STILL_SHARE, LATE_TELEMETRY_S = 0.5, 2.0
+DOUBLED_S = 0.5  # a second way of the telemetry, by a radio, takes so much longer
 DROPPED, DOUBLED, SEED = 0.15, 0.15, 1
 PIXELS, UNKNOWN = frozenset({Need.PIXELS}), frozenset({Need.UNKNOWN})
 
@@ -114,35 +125,41 @@ FALSE_INPUTS = (
         "The camera repeats one picture for 15 s, with new noise each time.",
         FROZEN_S,
         partial(pictures.stale_buffers, buffers=1),
+        cause="picture frozen",
     ),
     Fault(
         "four stale buffers",
         "The camera repeats four pictures in turn for 15 s.",
         FROZEN_S,
         partial(pictures.stale_buffers, buffers=BUFFERS),
+        cause="picture frozen",
     ),
     Fault(
         "camera falls behind",
         "For 15 s the pictures play at half their speed, then the camera is live.",
         FROZEN_S,
         partial(pictures.falling_behind, lag_s=FROZEN_S / 2),
+        cause="camera .* late",
     ),
     Fault(
         "stream falls behind",
         "For 40 s the delay of the pictures grows evenly to 2 s, then the camera is live.",
         40.0,
         partial(pictures.falling_behind, lag_s=2.0),
+        cause="camera .* late",
     ),
     Fault(
         "picture squeezed in one axis",
         "16:9 is shown as 4:3 in every picture: one axis has another scale than the description says.",
         source=shown(pictures.scaled(1.0, 4.0 / 3.0)),
+        cause="squeezed",
     ),
     Fault(
         "camera upside down",
         "For 20 s the pictures are turned by 180 degrees, as after a reboot of the camera.",
         20.0,
         shown(pictures.upside_down),
+        cause="upside down",
     ),
     Fault(
         "foreign frames in a row",
@@ -160,11 +177,13 @@ FALSE_INPUTS = (
         "telemetry 2 s late",
         "All that the autopilot reports is two seconds old when it gets its time.",
         telemetry=whole(edits.late_telemetry(LATE_TELEMETRY_S)),
+        cause="telemetry .* late",
     ),
     Fault(
         "pictures 1 s late",
         "Every picture is a second old when it gets its time.",
         source=whole(pictures.late_pictures(LATE_S)),
+        cause="camera .* late",
     ),
     Fault(
         "forged tilt",
@@ -229,6 +248,8 @@ STREAMED = (  # as a stream or its receiver fails in flight
         "For 20 s every picture is 1.4 s old when it gets its time.",
         20.0,
         lambda span: during(span, pictures.late_pictures(1.4)),
+        past_s=2.0,
+        cause="camera .* late",
     ),
     Fault(
         "frozen picture that jitters",
@@ -236,12 +257,62 @@ STREAMED = (  # as a stream or its receiver fails in flight
         FROZEN_S,
         pictures.jittering,
         needs=PIXELS,
+        cause="picture frozen",
+    ),
+    Fault(
+        "pictures of another time",
+        "For 10 s the pictures are those of 25 s before.",
+        FOREIGN_S,
+        lambda span: during(span, pictures.late_pictures(pictures.FOREIGN_LAG_S)),
+        past_s=pictures.FOREIGN_LAG_S + 1.0,
+        cause="contradicts motion",
+    ),
+    Fault(
+        "water",
+        "For 60 s the camera sees open water.",
+        60.0,
+        pictures.water,
+        needs=PIXELS,
+        is_true=True,
+        cause="without texture",
     ),
     Fault(
         "zoom that creeps",
         "For 20 s the focal length grows to 1.3 times that of the description.",
         20.0,
         partial(pictures.zooming, factor=1.3),
+        cause="focal",
+    ),
+)
+LIVE = (  # which need a rig
+    Fault(
+        "pictures of another place",
+        "For 10 s the pictures are those of a flight elsewhere.",
+        FOREIGN_S,
+        process=Process(show_another_place, show_own_place),
+        needs=frozenset({Need.ELSEWHERE}),
+        cause="contradicts motion",
+    ),
+    Fault(
+        "telemetry comes twice",
+        "For 10 s all that the autopilot sends comes a second time, half a second later.",
+        FORGED_S,
+        process=Process(partial(set_doubled, after_s=DOUBLED_S), partial(set_doubled, after_s=None)),
+        cause="two senders",
+    ),
+    Fault(
+        "computer four times too slow",
+        "For 20 s each process runs a quarter of the time.",
+        20.0,
+        process=Process(during=slow_all, end=go_on_all),
+        cause="too slow",
+    ),
+    Fault(
+        "start on a moving deck",
+        "A copter stands disarmed on a deck that moves with 6 m/s for 22 s, takes off and climbs to 100 m.",
+        DECK_S + CLIMB_S,
+        needs=frozenset({Need.DECK}),
+        cause="take-off|start",
     ),
 )
 INPUTS = {fault.name: fault for fault in (*CAMERA, *FALSE_INPUTS)}
@@ -256,7 +327,7 @@ SCENARIOS: tuple[Fault, ...] = (  # of several faults
 MATRIX = (NONE, *KILLED_AND_LIMITED, *CAMERA, *AROUND_THEM)  # what `terrafix chaos` flies if no fault is named
 FAULTS = {
     fault.name: fault
-    for fault in (*MATRIX, *FALSE_INPUTS, *STREAMED, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *MATCHES, *SCENARIOS)
+    for fault in (*MATRIX, *FALSE_INPUTS, *STREAMED, *LIVE, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *MATCHES, *SCENARIOS)
 }
 
 

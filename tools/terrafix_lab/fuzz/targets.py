@@ -32,6 +32,7 @@ from terrafix.recorder.writer import FlightWriter
 from terrafix.vision.sources import parse_start
 from terrafix.vision.sources.description import read_description
 from terrafix.vision.sources.exif import read_info
+from terrafix.vision.sources.gpmf import read_gpmf
 from terrafix.vision.sources.images import decode_image
 from terrafix.vision.sources.mjpeg import MjpegCapture
 from terrafix.vision.sources.table import read_table
@@ -346,6 +347,46 @@ def _read_elevation(path: Path) -> None:
         height_statement(file, path, heights, crs_of(file, path), (3e5, 5e6))
 
 
+def _gopro_payload() -> bytes:
+    """Device, name and streams of one payload of a GoPro; GPMF as its reference describes it."""
+
+    def item(key: str, kind: str, size: int, count: int, values: bytes) -> bytes:
+        head = key.encode() + struct.pack(">cBH", kind.encode(), size, count)
+        return head + values + b"\0" * (-len(values) % 4)
+
+    fixes = b"".join(struct.pack(">5i", 480_000_000 + 10 * k, 110_000_000, 500_000, 1000, 100) for k in range(10))
+    scales = struct.pack(">5i", 10_000_000, 10_000_000, 1000, 1000, 100)
+    gps = item("GPSF", "L", 4, 1, struct.pack(">I", 3)) + item("SCAL", "l", 4, 5, scales)
+    gps += item("GPS5", "l", 20, 10, fixes)
+    accelerations = item("SCAL", "s", 2, 1, struct.pack(">h", 418)) + item("ACCL", "s", 6, 4, bytes(24))
+    streams = b"".join(item("STRM", "\0", 1, len(one), one) for one in (gps, accelerations))
+    device = item("DVNM", "c", 1, 12, b"HERO10 Black") + streams
+    return item("DEVC", "\0", 1, len(device), device)
+
+
+def gopro_video(head: bytes = b"", payloads: int = 3, moov: bytes = b"") -> bytes:
+    """An MP4 with a track of GoPro's telemetry, a payload a second, after ``head``; ``moov``: further tracks."""
+
+    def box(kind: bytes, *parts: bytes) -> bytes:
+        content = b"".join(parts)
+        return struct.pack(">I4s", 8 + len(content), kind) + content
+
+    payload = _gopro_payload()
+    media = box(b"mdat", payload * payloads)
+    first = len(head) + 8
+    places = struct.pack(f">II{payloads}I", 0, payloads, *(first + len(payload) * k for k in range(payloads)))
+    table = box(
+        b"stbl",
+        box(b"stsd", struct.pack(">III4s", 0, 1, 16, b"gpmd")),
+        box(b"stts", struct.pack(">IIII", 0, 1, payloads, 1000)),
+        box(b"stsc", struct.pack(">IIIII", 0, 1, 1, 1, 1)),
+        box(b"stsz", struct.pack(">III", 0, len(payload), payloads)),
+        box(b"stco", places),
+    )
+    clock = box(b"mdhd", struct.pack(">IIIII", 0, 0, 0, 1000, 1000 * payloads))
+    return head + media + box(b"moov", moov, box(b"trak", box(b"mdia", clock, box(b"minf", table))))
+
+
 def _start(data: bytes) -> None:
     parse_start(data.decode("utf-8", "replace"))
 
@@ -373,6 +414,7 @@ TARGETS: tuple[Target, ...] = (
     Target("area", _kml, _in_file(".kml", lambda path: read_area(str(path), corridor_km=1.0))),
     Target("tile file", _tile_files, _in_file(".mbtiles", _read_tiles)),
     Target("elevation", _elevations, _in_file(".tif", _read_elevation)),
+    Target("GoPro telemetry", lambda: [gopro_video(), _gopro_payload()], _in_file(".mp4", read_gpmf)),
     Target("DataFlash log", _dataflash_logs, _in_file(".bin", read_autopilot_log)),
     Target("autopilot log", _logs, _in_file(".tlog", read_autopilot_log)),
     Target("start", lambda: [b"48.1,11.2"], _start),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from terrafix.core.errors import OutputError, UsageError
@@ -25,6 +25,7 @@ from terrafix_lab.montecarlo.flight import Record, run
 from terrafix_lab.montecarlo.picture import draw
 from terrafix_lab.montecarlo.plan import DURATION_S, plan
 from terrafix_lab.montecarlo.statistics import FlightResult, floors, summary
+from terrafix_tools.progress import LineProgress
 
 COMMAND = "terrafix montecarlo --fault"  # of terrafix_lab.faults.fault.CAMPAIGNS
 FLYABLE = [name for name, fault in FAULTS.items() if not lacking(COMMAND, fault)]
@@ -96,7 +97,7 @@ def _fly_all(options: RunOptions, console: Console) -> list[Record]:
     numbers = range(options.first, options.first + options.flights)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     records: dict[int, Record] = {}
-    with Progress(*columns, console=console, transient=True) as progress:
+    with LineProgress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("flights", total=options.flights)
         for number, record in _results(options, numbers):
             records[number] = record

@@ -82,7 +82,7 @@ class SimulatedOdometry:
         inliers = None if missed else self._tracked(keyframe, shot)
         if inliers is None:
             self._misses += 1
-            if self._misses >= real.MAX_FAILURES or keyframe.age >= MAX_KEYFRAME_AGE:
+            if self._misses >= real.MAX_TRACK_FAILURES or keyframe.age >= MAX_KEYFRAME_AGE:
                 return self._new_fragment(frame_id, t_ns, shot, blind)
             return Odometry(t_ns=t_ns, frame_id=frame_id, keyframe_id=keyframe.frame_id, verdict=Verdict.FEW_INLIERS)
         a, b, tracked = inliers
@@ -93,7 +93,7 @@ class SimulatedOdometry:
             or len(a) < real.KEYFRAME_TRACKED * len(keyframe.px)
             or keyframe.age >= MAX_KEYFRAME_AGE
         )
-        pick = np.linspace(0, len(a) - 1, min(len(a), real.MAX_PAIRS)).astype(int)
+        pick = np.linspace(0, len(a) - 1, min(len(a), real.MAX_ODOMETRY_PAIRS)).astype(int)
         pairs = np.hstack([self._camera.normalise(a[pick]), self._camera.normalise(b[pick])])
         triples = np.zeros((0, 6))
         if due:
@@ -136,9 +136,9 @@ class SimulatedOdometry:
             keyframe.frame_id,
         )
         three = np.flatnonzero(np.isfinite(keyframe.before_px[indices, 0]))
-        if len(three) < real.MIN_TRIPLES:
+        if len(three) < real.MIN_ODOMETRY_TRIPLES:
             return following, np.zeros((0, 6))
-        pick = three[np.linspace(0, len(three) - 1, min(len(three), real.MAX_TRIPLES)).astype(int)]
+        pick = three[np.linspace(0, len(three) - 1, min(len(three), real.MAX_ODOMETRY_TRIPLES)).astype(int)]
         views = keyframe.before_px[indices[pick]], keyframe.px[indices[pick]], px[pick]
         return following, np.hstack([self._camera.normalise(view) for view in views])
 
@@ -155,7 +155,7 @@ class SimulatedOdometry:
         if len(a) < real.TRACK_MIN_INLIERS:
             return None
         inlier = homography_inliers(a, b)
-        if inlier.sum() < real.TRACK_MIN_INLIERS or inlier.mean() < real.MIN_INLIER_RATIO:
+        if inlier.sum() < real.TRACK_MIN_INLIERS or inlier.mean() < real.TRACK_MIN_INLIER_RATIO:
             return None
         keyframe.tracked[np.flatnonzero(keyframe.tracked)[~inlier]] = False  # outliers are dropped for good
         return a[inlier], b[inlier], len(a)

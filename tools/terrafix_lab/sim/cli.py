@@ -8,6 +8,7 @@ import typer
 from terrafix.core.errors import UsageError
 from terrafix_lab.sim.autopilot.parameters import Gps, Kind
 from terrafix_lab.sim.world.map_content import MapContent
+from terrafix_tools.installation import install_command
 
 # Options of both `make` and `fly`.
 Seed = Annotated[int, typer.Option(help="Seed of the generated place, the course and all errors.")]
@@ -61,7 +62,7 @@ def ardupilot(
     except ModuleNotFoundError as error:
         if error.name != "mavsdk":
             raise
-        raise UsageError("this command needs mavsdk; install it: pip install 'terrafix[sim]'") from None
+        raise UsageError(f"this command needs mavsdk; install it: {install_command('sim')}") from None
 
     code = fly_firmware(
         out,

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import CalibrationEstimate, CalibrationFault, ClaimBudget, Origin
-from terrafix.recorder.reader import read_flight
+from terrafix.recorder.reader import ReadResult, read_received
 from terrafix_tools.before_after import Change
+from terrafix_tools.camera_times import CameraTimes
 from terrafix_tools.finalised import SUMMARY, read_flights
 from terrafix_tools.lens_report import lens_words
 
@@ -30,7 +31,9 @@ def camera_check(record: Path) -> Iterator[str]:
     estimate: CalibrationEstimate | None = None
     budget: ClaimBudget | None = None
     faults: dict[str, CalibrationFault] = {}
-    for _, _, message in read_flight(record):
+    times = CameraTimes()
+    for _, _, received_ns, message in read_received(record, ReadResult()):
+        times.take(received_ns, message)
         if isinstance(message, Origin):
             origin = message
         elif isinstance(message, CalibrationEstimate):
@@ -56,6 +59,7 @@ def camera_check(record: Path) -> Iterator[str]:
             yield f"  {what}: {value:+.3g} +- {sigma:.2g} {unit}".rstrip() + mark
         if words := lens_words(camera, estimate):
             yield f"lens: {words}"
+    yield from (f"time: {words}" for words in times.words())
     if budget is not None and (variance := budget.terms_m2.get("time_offset")):
         yield f"time offset of the images: adds {math.sqrt(variance):.2g} m to the claim (1-sigma) at the end"
     for fault in faults.values():

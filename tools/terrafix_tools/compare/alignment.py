@@ -14,6 +14,7 @@ import msgspec
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import Imu, InputOrder, MeasurementVerdict, Message, NavEstimate, Origin
+from terrafix.processes import PROCESSES
 from terrafix.recorder.reader import ReadResult, check_format, read_received
 
 NS = 1_000_000_000
@@ -24,6 +25,13 @@ CLOCK_FIELDS = ("emitted_at_ns",)
 TIME_FIELDS = ("t_ns", "prior_t_ns")
 # Messages with further times in their contents: compared only when both records have the same clock.
 CLOCKED: tuple[type[Message], ...] = (Imu, InputOrder)
+# What a replay can have: the messages of its processes (docs/architecture.md).
+REPLAYED = frozenset(
+    kind.__name__
+    for process in PROCESSES
+    if process.name in ("vision", "anchor", "estimator")
+    for kind in process.publishes
+)
 
 
 class Key(NamedTuple):
@@ -55,6 +63,7 @@ class ComparedRecord:
     frame_t_s: dict[int, float] = field(default_factory=dict)
     estimates: dict[int, ComparedEstimate] = field(default_factory=dict)
     verdicts: Counter[tuple[str, str]] = field(default_factory=Counter)  # measurement, verdict
+    verdict_of: dict[Key, str] = field(default_factory=dict)  # of each MeasurementVerdict
 
 
 def read_record(path: Path) -> ComparedRecord:
@@ -72,6 +81,7 @@ def read_record(path: Path) -> ComparedRecord:
             record.estimates[message.frame_id] = _estimate(message, record.origin.t_ns)
         elif isinstance(message, MeasurementVerdict):
             record.verdicts[message.measurement, str(message.verdict)] += 1
+            record.verdict_of[key] = str(message.verdict)
     check_format(path, result)
     if record is None:
         raise SourceError(f"{path}: the record has no messages; give the output of replay or run")

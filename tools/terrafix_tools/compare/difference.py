@@ -8,7 +8,7 @@ import numpy as np
 from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.recorder.reader import ReadResult
-from terrafix_tools.compare.alignment import CLOCKED, NS, ComparedRecord, Key, contents, keyed
+from terrafix_tools.compare.alignment import CLOCKED, NS, REPLAYED, ComparedRecord, Key, contents, keyed
 
 MAX_FIELDS = 8  # differing fields of a message that are listed
 SAME_START_M = 0.01  # two origins of one flight are equal but for rounding
@@ -18,6 +18,8 @@ def compare_records(a: ComparedRecord, b: ComparedRecord) -> dict[str, Any]:
     """-> the comparison as JSON (docs/compare.md). Raises SourceError for records of two flights."""
     _check_same_flight(a, b)
     left_out = () if a.origin.t_ns == b.origin.t_ns else tuple(kind.__name__ for kind in CLOCKED)
+    live = _only_live(a, b)
+    left_out = (*left_out, *(kind for kind in live if kind not in left_out))
     keys = [key for key in a.digests if key.kind not in left_out]
     differing = [key for key in keys if key in b.digests and a.digests[key] != b.digests[key]]
     only_a = [key for key in keys if key not in b.digests]
@@ -29,6 +31,8 @@ def compare_records(a: ComparedRecord, b: ComparedRecord) -> dict[str, Any]:
         "equal": not (differing or only_a or only_b),
         "compared": len(keys) + len(only_b),
         "not_compared": list(left_out),
+        "only_live": live,
+        "first_verdict": _first_verdict(a, b, left_out),
         "first": first[0] if first else None,
         "first_of_each_message": first,
         "messages": _counts(keys, differing, only_a, only_b),
@@ -37,6 +41,31 @@ def compare_records(a: ComparedRecord, b: ComparedRecord) -> dict[str, Any]:
         "delay_ms": {"a": _delays(a), "b": _delays(b)},
         "configuration": _changed(a.result.header.get("config"), b.result.header.get("config")),
         "versions": _changed(a.result.header.get("versions"), b.result.header.get("versions")),
+    }
+
+
+def _only_live(a: ComparedRecord, b: ComparedRecord) -> list[str]:
+    """Types of messages that one of the two has, a live record, and that the other, a replay, cannot have."""
+    kinds_a, kinds_b = ({key.kind for key in record.digests} for record in (a, b))
+    if kinds_a <= REPLAYED or kinds_b <= REPLAYED:
+        return sorted((kinds_a | kinds_b) - REPLAYED)
+    return []
+
+
+def _first_verdict(a: ComparedRecord, b: ComparedRecord, left_out: tuple[str, ...]) -> dict[str, Any] | None:
+    """The earliest verdict on a measurement that is another one, or in one record alone; None: all are the same."""
+    times = _times(a) | _times(b)
+    keys = [key for key in a.verdict_of.keys() | b.verdict_of.keys() if key.kind not in left_out]
+    changed = [key for key in keys if a.verdict_of.get(key) != b.verdict_of.get(key)]
+    if not changed:
+        return None
+    first = min(changed, key=lambda key: times[key])
+    return {
+        "measurement": first.measurement,
+        "frame_id": first.frame_id,
+        "t_s": round(times[first][0], 3),
+        "a": a.verdict_of.get(first),
+        "b": b.verdict_of.get(first),
     }
 
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from terrafix_tools.compare.text import divergence, summary
-from terrafix_tools.pages.charts import Chart, Point, clock
+from terrafix_tools.pages.charts import Chart, Point, stamp
 from terrafix_tools.pages.document import kit
 
 MIN_DISTANCE_M = 0.01  # height of the chart where the positions are equal
@@ -15,7 +15,7 @@ def page(comparison: dict[str, Any], distances_m: list[tuple[float, float]]) -> 
     return kit.document(
         f"{a} and {b}",
         "",
-        kit.header("Terrafix, two records of one flight", next(summary(comparison)), f"A: {a} · B: {b}"),
+        kit.header("Terrafix, two records of one flight", _verdict(comparison), f"A: {a} · B: {b}"),
         _distances(comparison, distances_m),
         _differences(comparison),
         _messages(comparison),
@@ -23,6 +23,11 @@ def page(comparison: dict[str, Any], distances_m: list[tuple[float, float]]) -> 
         _delays(comparison),
         _changes(comparison),
     )
+
+
+def _verdict(comparison: dict[str, Any]) -> str:
+    lines = list(summary(comparison))
+    return "; ".join(lines[: 3 if comparison["first_verdict"] else 2])
 
 
 def _distances(comparison: dict[str, Any], distances_m: list[tuple[float, float]]) -> str:
@@ -34,7 +39,7 @@ def _distances(comparison: dict[str, Any], distances_m: list[tuple[float, float]
     chart.line(points, "error")
     first = comparison["first"]
     if first is not None:
-        chart.vertical_line(first["t_s"], "first difference")
+        chart.vertical_line(max(0.0, first["t_s"]), "first difference")
     return kit.section(
         "Distance of the positions",
         "Horizontal, between the last estimates of each frame.",
@@ -45,7 +50,7 @@ def _distances(comparison: dict[str, Any], distances_m: list[tuple[float, float]
 def _differences(comparison: dict[str, Any]) -> str:
     if comparison["equal"]:
         return ""
-    rows = ((clock(round(found["t_s"])), divergence(found)) for found in comparison["first_of_each_message"])
+    rows = ((stamp(found["t_s"]), divergence(found)) for found in comparison["first_of_each_message"])
     return kit.section("First difference of each message", "", kit.timeline(rows))
 
 

@@ -8,7 +8,10 @@ MAX_SETTINGS = 10  # changed settings that are shown
 
 
 def summary(comparison: dict[str, Any]) -> Iterator[str]:
-    """Lines for a terminal, the verdict first."""
+    """Lines for a terminal: how far the positions are apart, the first verdict that changed, then the messages."""
+    yield from _positions(comparison["positions"])
+    if comparison["first_verdict"]:
+        yield f"first verdict that changed: {changed_verdict(comparison['first_verdict'])}"
     if comparison["equal"]:
         yield f"equal: all {comparison['compared']} messages"
     else:
@@ -18,12 +21,14 @@ def summary(comparison: dict[str, Any]) -> Iterator[str]:
         yield f"first difference: {divergence(comparison['first'])}"
         for found in comparison["first_of_each_message"][1:]:
             yield f"  first {divergence(found)}"
-    if comparison["not_compared"]:
-        yield f"not compared, because the clocks differ: {', '.join(comparison['not_compared'])}"
+    clocked = [kind for kind in comparison["not_compared"] if kind not in comparison["only_live"]]
+    if clocked:
+        yield f"not compared, because the clocks differ: {', '.join(clocked)}"
+    if comparison["only_live"]:
+        yield f"not compared, because a replay has none: {', '.join(comparison['only_live'])}"
     for name in ("a", "b"):
         for file in comparison[name]["cut_off"]:
             yield f"{comparison[name]['path']}: {file} ends in the middle of a record"
-    yield from _positions(comparison["positions"])
     yield from _verdicts(comparison["verdicts"])
     yield from _delays(comparison["delay_ms"])
     for what in ("configuration", "versions"):
@@ -35,12 +40,23 @@ def divergence(found: dict[str, Any]) -> str:
     """One difference: "NavEstimate of frame 12 at 6.000 s: lat_deg 48.1 -> 48.2"."""
     frame = f" of frame {found['frame_id']}" if "frame_id" in found else ""
     measurement = f" ({found['measurement']})" if "measurement" in found else ""
-    where = f"{found['message']}{measurement}{frame} at {found['t_s']:.3f} s"
+    where = f"{found['message']}{measurement}{frame} {at(found['t_s'])}"
     if "only_in" in found:
         return f"{where}: only in {found['only_in'].upper()}"
     fields = ", ".join(f"{f['field']} {shortened(f['a'])} -> {shortened(f['b'])}" for f in found["fields"])
     more = f" and {found['more_fields']} more fields" if found["more_fields"] else ""
     return f"{where}: {fields}{more}"
+
+
+def at(t_s: float) -> str:
+    """A time since the start of the flight."""
+    return f"at {t_s:.3f} s" if t_s >= 0 else f"{-t_s:.3f} s before the start"
+
+
+def changed_verdict(found: dict[str, Any]) -> str:
+    """ "map of frame 41 at 20.500 s: accepted -> innovation"."""
+    frame = f" of frame {found['frame_id']}" if found["frame_id"] >= 0 else ""
+    return f"{found['measurement']}{frame} {at(found['t_s'])}: {found['a'] or 'none'} -> {found['b'] or 'none'}"
 
 
 def shortened(value: Any) -> str:

@@ -9,7 +9,6 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import msgspec
 
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import TerrafixError
+from terrafix.core.flight_id import live_flight_id
 from terrafix.core.frames import SharedFrameStore
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M
 from terrafix.messages import Frame, HintVerdict, MapMatch, Message, NavEstimate, Origin, Refinement, SearchPlaces
@@ -75,7 +75,7 @@ def run_to_follow(bus: str) -> RunDir | None:
 
 def flight_id_of(run: RunDir) -> str:
     """The same for one run, whichever service follows it."""
-    return f"live-{sha256(f'{run.path}{run.epoch_ns}'.encode()).hexdigest()[:12]}"
+    return live_flight_id(run.epoch_ns or 0)
 
 
 class LiveFlights:
@@ -179,7 +179,7 @@ class LiveFlights:
     def _begin(self, run: RunDir, spec: Spec) -> LiveRun:
         flight_id, epoch_ns = flight_id_of(run), run.epoch_ns
         observer = FlightObserver(lambda frame_id: f"/flights/{flight_id}/frames/{frame_id}/image")
-        observer.origin_ns = epoch_ns or 0
+        observer.origin_ns, observer.flight_id = epoch_ns or 0, flight_id
         map_path = None if spec.map_path is None else Path(spec.map_path)
         with self._database.write() as db:
             flights.create_live(

@@ -40,10 +40,12 @@ class Ellipse(BaseModel):
 
 
 class CameraPose(BaseModel):
-    """A refined camera, beside its position. ``orientation``: quaternion w, x, y, z in east, north, up; ``covariance``:
-    36 numbers, row by row, of position [m], then rotation [rad] about east, north, up; ``m_per_unit``: metres of a unit
-    of odometry in the submap of the frame. None: not refined."""
+    """A camera, beside its position. ``frame_uid``: unique over all flights. The others are refined; None: not refined.
+    ``orientation``: quaternion w, x, y, z in east, north, up; ``covariance``: 36 numbers, row by row, of position [m],
+    then rotation [rad] about east, north, up; ``m_per_unit``: metres of a unit of odometry in the submap of the
+    frame."""
 
+    frame_uid: str = ""
     orientation: list[float] | None = None
     covariance: list[float] | None = None
     m_per_unit: float | None = None

@@ -28,7 +28,7 @@ from terrafix.estimator.factors.three_view import (
 from terrafix.estimator.filter_state import scale_sigma
 from terrafix.estimator.models.bias_walk import BAROMETER_SCALE_SIGMA
 from terrafix.estimator.models.lens_prior import radial_k1_sigma
-from terrafix.estimator.models.plane_motion import RelativePose
+from terrafix.estimator.models.plane_motion import MatchedRays, RelativePose
 from terrafix.estimator.models.terrain import LEVEL_M
 from terrafix.estimator.state import (
     CALIBRATION_SIZE,
@@ -248,8 +248,8 @@ class _Smoothing:
         repeats = float(np.sqrt(len(self._nodes)))  # relief is no new one in each pair: as a whole they give the prior
         noise = LensNoise(repeats * radial_k1_sigma(camera), repeats * camera.focal_sigma)
         of_plane = noise if self._sees_lens else None
-        keys = C(parent), C(i), B(i)
-        return plane_two_view_factor(*keys, keyframe, pose, pairs, sigma, ground, B(parent), lens.k1, of_plane)
+        seen = MatchedRays(pairs, sigma, ground, lens.k1)
+        return plane_two_view_factor(C(parent), C(i), B(i), keyframe, pose, seen, B(parent), of_plane)
 
     def _three_view_factor(self, node: RecordedNode, i: int, focal: FocalKey) -> Iterator[gtsam.NonlinearFactor]:
         seen = node.triples

@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 
 from terrafix.core.geodesy import rot_from_quat
-from terrafix.core.pnp import INDEPENDENT_SHARE, PNP_MIN_INLIERS, outlier_inflation, random_inlier_probability
-from terrafix.core.pose import HUBER_K, exp_so3, fit_pose, project_with_jacobian
+from terrafix.core.pnp import INDEPENDENT_MATCH_SHARE, PNP_MIN_INLIERS, outlier_inflation, random_inlier_probability
+from terrafix.core.pose import POSE_HUBER_K, exp_so3, fit_pose, project_with_jacobian
 from terrafix.estimator.factors.noise import whiten_common
 from terrafix.estimator.measurements.map_pose import LOCAL_WARP, ROOFS
 from terrafix.estimator.models.terrain import Terrain
@@ -144,9 +144,9 @@ class MatchedPoints:
         _, by_pose, _ = project_with_jacobian(fit.r_w_c, fit.p_m, points_m)
         by_lens = np.stack([np.sum(rays**2, axis=1, keepdims=True) * rays, rays], axis=2)
         full = np.concatenate([by_pose, by_lens, own[:, :, None]], axis=2).reshape(2 * len(rays), -1)
-        agrees = np.minimum(1.0, HUBER_K * fit.sigma / np.maximum(np.linalg.norm(own, axis=1), 1e-12))
+        agrees = np.minimum(1.0, POSE_HUBER_K * fit.sigma / np.maximum(np.linalg.norm(own, axis=1), 1e-12))
         inflation = outlier_inflation(len(self.xy), len(rays), random_inlier_probability(self.given))
-        weight = agrees * self.weights[fit.inliers] * INDEPENDENT_SHARE / inflation
+        weight = agrees * self.weights[fit.inliers] * INDEPENDENT_MATCH_SHARE / inflation
         whiten = np.repeat(np.sqrt(weight) / fit.sigma, 2)[:, None]
         reduced = np.linalg.qr(whiten_common(full * whiten, self._common(by_pose, points_m, fit) * whiten), mode="r")
         pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(fit.r_w_c), fit.p_m)

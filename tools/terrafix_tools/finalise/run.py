@@ -12,7 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 
 from terrafix.core.camera import Mount
 from terrafix.core.errors import SourceError
@@ -32,6 +32,7 @@ from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, Choice, Comparison, choose
 from terrafix_tools.finalise.point_cloud import POINTS, VERTEX, cloud_name, write_ply
 from terrafix_tools.finalised import TABLE, FinalRow, write
+from terrafix_tools.progress import LineProgress
 
 # Messages that the estimator subscribes to. SourceEnded is left out: it starts the estimator's own refinement.
 REPLAYED = tuple(t for p in PROCESSES if p.name == "estimator" for t in p.subscribes if t is not SourceEnded)
@@ -304,7 +305,7 @@ def _changes(flight: FlightGraph, found: Smoothed, choice: Choice) -> list[dict[
 def bar(shown: bool) -> Iterator[Step]:
     """-> progress as a bar on standard error."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown, transient=True) as bar:
+    with LineProgress(*columns, console=Console(stderr=True), shown=shown, transient=True) as bar:
         tasks: dict[str, Any] = {}
 
         def step(name: str, done: int, of: int | None) -> None:

@@ -90,9 +90,10 @@ def _months(tables: FleetTables) -> str:
     for month, row in zip(at, rows, strict=True):
         tip = f"{row['month']:%Y-%m}: {_percent(row['refused'])} % refused, {row['flights']} flights"
         chart.bar(month - 0.4, month + 0.4, 100 * (row["refused"] or 0), "refused", tip)
+    share_of = {month: row["availability"] for month, row in zip(at, rows, strict=True)}
     without: list[Point] = [
-        (month, None if row["availability"] is None else 100 * (1 - row["availability"]))
-        for month, row in zip(at, rows, strict=True)
+        (month, None if share_of.get(month) is None else 100 * (1 - share_of[month]))
+        for month in range(at[0], at[-1] + 1)
     ]
     chart.line(without, "none")
     return kit.section(

@@ -15,6 +15,7 @@ from pyarrow import dataset
 from terrafix.core.errors import SourceError, UsageError
 from terrafix_tools.fleet.store import check_fleet, read_list
 from terrafix_tools.fleet.tables import PART, PARTITIONS, RECORDS, TABLES
+from terrafix_tools.installation import install_command
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -56,7 +57,7 @@ class FleetTables:
         try:
             import duckdb
         except ModuleNotFoundError:
-            raise UsageError("queries of a fleet need duckdb; install it: pip install 'terrafix[fleet]'") from None
+            raise UsageError(f"queries of a fleet need duckdb; install it: {install_command('fleet')}") from None
         self._folder = folder
         self._duckdb_error = duckdb.Error
         self._select = duckdb.StatementType.SELECT

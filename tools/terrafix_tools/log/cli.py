@@ -130,12 +130,35 @@ def lines(
 @app.command()
 def export(
     record: Annotated[Path, typer.Argument(help="Record, or folder of replay or run.")],
-    out: Annotated[Path, typer.Argument(help="File to write: .csv .parquet .geojson .kml .kmz .gpx .gpkg")],
+    out: Annotated[Path, typer.Argument(help="File or folder to write.")],
+    name: Annotated[str, typer.Option("--format", help="docs/exports.md; default: by the name of OUT.")] = "",
+    which: Annotated[str, typer.Option(help="finalised, refined or immediate; default: the best there is.")] = "best",
+    photos: Annotated[Path | None, typer.Option(help="Folder with the photos of the flight.")] = None,
 ) -> None:
-    """The track in the format of the suffix of OUT."""
-    from terrafix_tools.log.export import export as run_export
+    """Positions for other programs: GIS, Google Earth, WebODM, Pix4D, Metashape, COLMAP, ROS, geotagged photos."""
+    from terrafix_tools.export.formats import export as run_export
 
-    typer.echo(f"{run_export(record, out)} positions; written to {out}")
+    typer.echo(run_export(record, out, name, which, photos))
+
+
+@app.command()
+def layout(
+    out: Annotated[Path, typer.Argument(help="File to write (.json); not over another.")] = Path(
+        "terrafix-layout.json"
+    ),
+) -> None:
+    """The layout in which Foxglove shows a record: map, frames, claims, gates, states, log. Import it there."""
+    from terrafix.core.installed_files import installed_files
+
+    file = installed_files() / "config" / "foxglove" / "terrafix-layout.json"
+    try:
+        with out.open("xb") as stream:
+            stream.write(file.read_bytes())
+    except FileExistsError:
+        raise OutputError(f"{out}: exists, and is not overwritten; name another file") from None
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another folder") from None
+    typer.echo(f"written to {out}; Foxglove: Layouts, Import from file, then open the record")
 
 
 @app.command()

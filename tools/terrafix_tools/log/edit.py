@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix.messages import Frame, Message, Origin
+from terrafix.messages import Frame, Message, Origin, SourceFacts
 from terrafix.recorder.provenance import copied_header
 from terrafix.recorder.reader import (
     ReadResult,
@@ -95,14 +95,15 @@ def rewrite(records: list[Path], out: Path, takes: Takes, result: ReadResult | N
 
 
 def _messages(records: list[Path], takes: Takes, result: ReadResult) -> Iterator[tuple[Message, int, int]]:
-    """Yields (message, time, time of reception). A segment repeats the Origin, and merged files may overlap by it."""
-    origins: list[Origin] = []
+    """Yields (message, time, time of reception). A segment repeats Origin and SourceFacts, and merged files may overlap
+    by them."""
+    repeated: list[Message] = []
     for record in records:
         for _, t_ns, received_ns, message in read_received(record, result):
-            if isinstance(message, Origin):
-                if message in origins:
+            if isinstance(message, (Origin, SourceFacts)):
+                if message in repeated:
                     continue
-                origins.append(message)
+                repeated.append(message)
             elif not takes(message, t_ns):
                 continue
             yield message, t_ns, received_ns

@@ -23,7 +23,11 @@ def crs_of(dataset: Any, path: Path) -> CRS:
     """Horizontal coordinate system of a raster. Raises MapError: not georeferenced, not on the earth, or as
     ``check_datum``."""
     if dataset.transform == Affine.identity():
-        raise MapError(f"{path}: {_without_transform(dataset, path)}")
+        try:
+            missing = _without_transform(dataset, path)
+        except UnicodeDecodeError:
+            missing = "what places it on the earth is damaged; download or export the file again"
+        raise MapError(f"{path}: {missing}")
     stated = stated_crs(dataset, path)
     if stated is None:
         raise MapError(f"{path}: has no coordinate system; add it with gdal_translate -a_srs EPSG:nnnnn IN OUT")

@@ -14,10 +14,10 @@ from terrafix.anchor.place_index.faiss_ivf import write_faiss
 from terrafix.anchor.place_index.format import (
     DEGREES,
     FAISS,
-    HEADER,
+    HEADER_FILE,
+    INDEX_VERSION,
     POSITIONS,
     VECTORS,
-    VERSION,
     Header,
     IndexedLayer,
     file_of,
@@ -110,7 +110,7 @@ def _write(packages: Sequence[Path], folder: Path, options: IndexOptions, descri
         write_faiss(every, folder / FAISS)
         names.append(FAISS)
     header = Header(
-        version=VERSION,
+        version=INDEX_VERSION,
         descriptor=describer.name,
         model=options.model,
         size=describer.size,
@@ -119,7 +119,7 @@ def _write(packages: Sequence[Path], folder: Path, options: IndexOptions, descri
         layers=tuple(layers),
         files={name: file_of(folder / name, hashed=True) for name in names},
     )
-    (folder / HEADER).write_bytes(msgspec.json.format(msgspec.json.encode(header)))
+    (folder / HEADER_FILE).write_bytes(msgspec.json.format(msgspec.json.encode(header)))
     return header
 
 

@@ -52,6 +52,9 @@ class ImagerySource:
         self.crs = crs
         self._colours = self._colour_table()
         self._nodata_is_held = self._file.nodata is None or holds(self._file.dtypes[0], self._file.nodata)
+        # GDAL takes an alpha band for the mask only where it is the last of two or four, and there is no nodata value.
+        alpha = [i for i, colour in enumerate(self._file.colorinterp, start=1) if colour == ColorInterp.alpha]
+        self._alpha = alpha[0] if alpha else None
         if self.warped:
             self._data, self._hidden = self._north_up(crs, hidden)
         self.width_px, self.height_px = int(self._data.width), int(self._data.height)
@@ -61,12 +64,10 @@ class ImagerySource:
         self.bands = self._choose_bands()
         # A mask in the file (alpha, mask band, nodata, in this order) is used; without one a collar is searched, of a
         # warped image on its own pixels.
-        alpha = [i for i, colour in enumerate(self._file.colorinterp, start=1) if colour == ColorInterp.alpha]
         flags = [f for band in self._file.mask_flag_enums for f in band]
         by_value = self._nodata_is_held and self._file.nodata is not None
-        self.file_has_mask = by_value or bool(alpha) or MaskFlags.per_dataset in flags
+        self.file_has_mask = by_value or self._alpha is not None or MaskFlags.per_dataset in flags
         self.has_mask = self.warped or self.file_has_mask
-        self._alpha = alpha[0] if alpha and self._file.nodata is not None and not self.warped else None
         self._stretch = self._find_stretch()
 
     def __enter__(self) -> "ImagerySource":
@@ -112,7 +113,7 @@ class ImagerySource:
         nodata = stated_nodata(file)
         if nodata and (file.nodata is None or not self._nodata_is_held):
             assumed += (f"nodata value {nodata} ignored, {file.dtypes[0]} cannot hold it",)
-        elif nodata and ColorInterp.alpha in file.colorinterp:
+        elif nodata and self._alpha is not None:
             assumed += (f"the alpha band is the mask, and not nodata {nodata}",)
         return (
             InputStatement(
@@ -151,14 +152,18 @@ class ImagerySource:
         return bands, self._read_mask(window)
 
     def _read_mask(self, window: Window) -> np.ndarray:
-        if self._alpha is not None:  # GDAL would take the nodata value of its bands
-            return (self._file.read(self._alpha, window=window) > 0).astype(np.uint8)
         if not self.has_mask:
             return np.full((int(window.height), int(window.width)), 255, np.uint8)
-        mask: np.ndarray = self._data.dataset_mask(window=window)
+        mask = self._mask_of_file(window=window)
         if self._hidden is not None:
             mask = np.where(self._hidden.read(1, window=window) == 0, mask, 0).astype(np.uint8)
         return mask
+
+    def _mask_of_file(self, **part: Any) -> np.ndarray:
+        """Not zero where valid. ``part``: window or shape, as rasterio takes them."""
+        if self._alpha is None:
+            return np.asarray(self._data.dataset_mask(**part))
+        return (self._data.read(self._alpha, **part) > 0).astype(np.uint8)
 
     def _to_bytes(self, bands: np.ndarray) -> np.ndarray:
         if self._colours is not None:
@@ -196,13 +201,13 @@ class ImagerySource:
             "width": math.ceil((float(x.max()) - x_min) / pixel),
             "height": math.ceil((y_max - float(y.min())) / pixel),
         }
-        has_alpha = ColorInterp.alpha in source.colorinterp
-        nodata = source.nodata if self._nodata_is_held and not has_alpha else None
+        nodata = source.nodata if self._nodata_is_held and self._alpha is None else None
         view = WarpedVRT(
             source,
             **grid,
             resampling=Resampling.nearest if self._colours is not None else Resampling.bilinear,
-            add_alpha=not has_alpha and nodata is None,
+            add_alpha=self._alpha is None and nodata is None,
+            src_alpha=self._alpha or 0,
             src_nodata=nodata,
             nodata=nodata,
         )
@@ -245,7 +250,7 @@ class ImagerySource:
         shape = (max(1, int(self.height_px / shrink)), max(1, int(self.width_px / shrink)))
         try:
             sample = self._data.read(self.bands, out_shape=(len(self.bands), *shape)).astype(np.float64)
-            mask = self._data.dataset_mask(out_shape=shape) > 0 if self.has_mask else np.ones(shape, bool)
+            mask = self._mask_of_file(out_shape=shape) > 0 if self.has_mask else np.ones(shape, bool)
         except RasterioError as error:
             raise MapError(f"{self.path}: cannot be read ({error}); check or download the file again") from None
         values = sample[:, mask]

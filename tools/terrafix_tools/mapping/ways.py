@@ -2,6 +2,7 @@
 operations)."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,6 +78,11 @@ def lacking_grids(group: TransformerGroup) -> tuple[str, float] | None:
     for operation in sorted(group.unavailable_operations, key=lambda o: (o.accuracy < 0.0, o.accuracy)):
         grids = [grid.short_name for grid in operation.grids if not grid.available]
         if grids:
-            sync = " ".join(f"--file {Path(grid).stem}" for grid in grids)
-            return f"PROJ lacks the grid {', '.join(grids)} (pyproj sync {sync})", float(operation.accuracy)
+            return lacking_text(grids), float(operation.accuracy)
     return None
+
+
+def lacking_text(grids: Sequence[str]) -> str:
+    """Which grids are missing, and the command that installs them."""
+    sync = " ".join(f"--file {Path(grid).stem}" for grid in grids)
+    return f"PROJ lacks the grid {', '.join(grids)} (pyproj sync {sync})"

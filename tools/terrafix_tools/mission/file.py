@@ -16,7 +16,7 @@ from terrafix_tools.mission.plan_complex import simple_items
 from terrafix_tools.text_file import read_text
 
 HEADER = "QGC WPL 110"  # of a file that is written; its first row is home
-HEADERS = re.compile(r"QGC WPL (\S+)")
+HEADERS = re.compile(r"\s*QGC WPL (\S+)")
 HOME_ROW, NO_HOME_ROW = "110", "120"  # versions of the format: 120 has no home, it is the list of QGroundControl
 COMMANDS = {
     16: Do.WAYPOINT,
@@ -47,8 +47,10 @@ def read_mission(path: Path, *, course_only: bool = False) -> Mission:
         raise SourceError(f"{path}: no such mission file; check --mission") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(f"{path}: cannot be read as a mission ({error})") from None
-    if header := HEADERS.match(text):
-        home, entries = _waypoints(path, text, header[1], allow_nan=course_only)
+    lines = text.splitlines()
+    first = next((i for i, line in enumerate(lines) if line.partition("#")[0].strip()), 0)
+    if lines and (header := HEADERS.match(lines[first])):
+        home, entries = _waypoints(path, lines, first, header[1], allow_nan=course_only)
     elif text.lstrip().startswith("{"):
         home, entries = _plan(path, text)
     else:
@@ -82,12 +84,15 @@ def _line(i: int, current: int, frame: int, command: int, params: tuple[float, .
     return "\t".join(str(cell) for cell in cells)
 
 
-def _waypoints(path: Path, text: str, version: str, *, allow_nan: bool) -> tuple[tuple[float, float], list[Entry]]:
-    """Home and the items of a waypoint file; row 0 is home, but of version 120. Lines after a # are comments."""
+def _waypoints(
+    path: Path, lines: list[str], header: int, version: str, *, allow_nan: bool
+) -> tuple[tuple[float, float], list[Entry]]:
+    """Home and the items of a waypoint file; row 0 is home, but of version 120. Lines after a # are comments.
+    ``header``: index of the line that names the format."""
     if version not in (HOME_ROW, NO_HOME_ROW):
         raise SourceError(f"{path}: a waypoint file of version {version}; save it as 'QGC WPL 110' or as a .plan")
     rows: list[list[float]] = []
-    for line_number, line in enumerate(text.splitlines()[1:], start=2):
+    for line_number, line in enumerate(lines[header + 1 :], start=header + 2):
         cells = line.partition("#")[0].split()
         if not cells:
             continue

@@ -13,12 +13,13 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.progress import BarColumn, DownloadColumn, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
 from terrafix.core.errors import ModelError, OutputError
 from terrafix_engines.manifest import Manifest
 from terrafix_engines.store import State, StoredModel, sha256_of
 from terrafix_tools.models.known import select_models, state_of
+from terrafix_tools.progress import LineProgress
 
 OnBytes = Callable[[int], None]  # called with the number of bytes received so far
 
@@ -111,6 +112,6 @@ def _copy(origin: Path, part: Path, on_progress: OnBytes) -> None:
 def _bar(manifest: Manifest) -> Iterator[OnBytes]:
     console = Console(stderr=True)
     columns = (TextColumn(manifest.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with LineProgress(*columns, console=console) as progress:
         task = progress.add_task(manifest.name, total=manifest.size_bytes)
         yield lambda received: progress.update(task, completed=received)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
+from itertools import pairwise
 
 from markupsafe import Markup
 
@@ -16,6 +17,7 @@ RIGHT = 14
 TOP = 12
 AXIS = 26  # bottom margin for the labels of the x axis
 TICKS_X = 9
+GAP = 5.0  # intervals of this many times the median are gaps, in which a line would claim what nobody has measured
 MARK = 3.0  # SVG units: marks that are nearer to each other are drawn once
 MAX_LOG_TICKS = 10  # number of ticks at 1, 2, 5, 10 ...; with more, only powers of ten are labelled
 
@@ -75,13 +77,17 @@ class Chart:
             self.marks.append(f'<polygon class="area {css}" points="{left:.1f},{floor} {text} {right:.1f},{floor}"/>')
 
     def _runs(self, points: Sequence[Point]) -> list[list[tuple[float, float]]]:
-        """SVG coordinates of the parts between gaps, thinned to what the width shows."""
+        """SVG coordinates of the parts between gaps, thinned to what the width shows. A gap is a value None, and on an
+        axis of time also an interval of GAP times the usual one."""
         runs: list[list[tuple[float, float]]] = [[]]
+        limit = GAP * usual_step([a for a, _ in points]) if self.x_unit == "s" else math.inf
+        before = math.inf
         for a, b in points:
-            if b is None:
+            if b is None or a - before > limit:
                 runs.append([])
-            else:
+            if b is not None:
                 runs[-1].append((self.x(a), self.y(b)))
+            before = a
         return [thin_line(run) for run in runs if run]
 
     def bar(self, x_low: float, x_high: float, value: float, css: str, tip: str) -> None:
@@ -153,6 +159,12 @@ class Chart:
             text = clock(value) if self.x_unit == "s" else f"{value:g} {self.x_unit}"
             parts.append(f'<text x="{self.x(value):.1f}" y="{y}" text-anchor="middle">{escape(text)}</text>')
         return "".join(parts)
+
+
+def usual_step(times: Sequence[float]) -> float:
+    """Median of the intervals; infinity where there are none."""
+    steps = sorted(b - a for a, b in pairwise(times) if b > a)
+    return steps[len(steps) // 2] if steps else math.inf
 
 
 def _share(value: float, low: float, high: float, log: bool) -> float:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from terrafix.core.errors import UsageError
+from terrafix_tools.installation import install_command
 from terrafix_tools.parallel.pool import Workload
 
 if TYPE_CHECKING:
@@ -30,4 +31,4 @@ def _dask_named() -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise UsageError(f"--scheduler needs {error.name}; install it: pip install 'terrafix[cluster]'") from None
+        raise UsageError(f"--scheduler needs {error.name}; install it: {install_command('cluster')}") from None

@@ -1,9 +1,12 @@
 """The command `terrafix preflight`."""
 
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from terrafix.core.errors import UsageError
 
 
 def preflight(
@@ -22,6 +25,9 @@ def preflight(
     yes: Annotated[bool, typer.Option("--yes", help="Skip the confirmation.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
     autopilot_only: Annotated[bool, typer.Option("--autopilot-only", help="Skip map, camera and computer.")] = False,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Practise: a simulated autopilot, one of whose parameters is wrong.")
+    ] = False,
     config: Annotated[
         list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")
     ] = None,
@@ -29,16 +35,33 @@ def preflight(
     """Check autopilot, map, camera and clocks before take-off. Exit code 1: a check failed."""
     from terrafix_tools.preflight.run import preflight as run_preflight
 
-    ready = run_preflight(
-        config or [],
-        link=link,
-        map_path=map_path,
-        mission=mission,
-        out=out,
-        write=write,
-        restore=restore,
-        yes=yes,
-        as_json=as_json,
-        with_computer=not autopilot_only,
-    )
+    with _practice(link) if simulate else nullcontext() as practice:
+        ready = run_preflight(
+            config or [],
+            link=practice.device if practice else link,
+            map_path=map_path,
+            mission=mission,
+            out=out,
+            write=write,
+            restore=restore,
+            yes=yes,
+            as_json=as_json,
+            with_computer=not (autopilot_only or simulate),
+        )
+        if practice and not as_json:
+            typer.echo(
+                f"\nFound: it was {practice.wrong}."
+                if practice.is_found
+                else "\nThe line that is not ok has the parameter and what to do; with --write preflight sets it."
+            )
     raise typer.Exit(0 if ready else 1)
+
+
+def _practice(link: str) -> Any:
+    """The simulated autopilot. Raises UsageError: there is another."""
+    from terrafix_tools.preflight.practice import Practice
+
+    if link:
+        raise UsageError("--simulate brings its own autopilot; omit --link")
+    typer.echo("A simulated ArduCopter 4.6, on the ground. One of its parameters is wrong: find it.\n", err=True)
+    return Practice()

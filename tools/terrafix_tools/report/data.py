@@ -24,6 +24,7 @@ from terrafix.messages import (
     ThermalReading,
 )
 from terrafix.recorder.reader import ReadResult
+from terrafix_tools.camera_times import CameraTimes
 from terrafix_tools.estimates import NS, Row
 from terrafix_tools.evaluate import Compared, Truth
 from terrafix_tools.log.contents import Contents
@@ -82,6 +83,7 @@ class FlightView:
     map_matches: list[tuple[float, int]] = field(default_factory=list)  # t_s, frame id; those with 2D-3D matches
     innovations: dict[str, Innovations] = field(default_factory=dict)  # by measurement
     stage_times: StageTimes = field(default_factory=StageTimes)
+    camera_times: CameraTimes = field(default_factory=CameraTimes)
     ekf: list[tuple[float, EkfStatus]] = field(default_factory=list)
     link_states: list[tuple[float, LinkStatus]] = field(default_factory=list)
     gnss_readings: list[tuple[float, GnssReading]] = field(default_factory=list)

@@ -109,6 +109,7 @@ def read_record(path: Path) -> tuple[RowTable, int, FlightView]:
         view.contents.take(t_ns, message)
         view.clocked = view.clocked or received_ns != message.t_ns
         view.stage_times.take(received_ns, message)
+        view.camera_times.take(received_ns, message)
         if isinstance(message, NavEstimate):
             # Delay of the last estimate of a frame, which is the one in its row; the recorder's clock has a resolution
             # of 10 ms.

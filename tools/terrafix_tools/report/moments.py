@@ -6,9 +6,10 @@ Candidates are of six kinds, in this order; within a kind the larger number is w
    the map [s];
 2. calibration faults [s until their end];
 3. links: the autopilot's link down, processes that died, were stuck or given up, gaps of GPS_INPUT [s];
-4. error against the truth [m], if there is truth;
-5. gates: test ratio above 1;
-6. stated accuracy: the semi-major axis of the 95 % ellipse [m].
+4. error against the truth [m], if there is truth: above LARGE_ERROR_M or beyond 3 sigma of the claim;
+5. gates: test ratio above 1; of a flight that can be trusted only a further reason, for a rejected measurement has done
+   no harm there;
+6. stated accuracy: the semi-major axis of the 95 % ellipse [m], where the link gives no fix for it.
 
 The kinds take turns, each with its worst peak that is left, until MAX_MOMENTS are chosen. A peak is a candidate that no
 worse one of its kind leads up to in steps of less than ``apart_s``: of a slowly decreasing radius only the beginning is
@@ -24,6 +25,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
+from terrafix.link.integrity.fix_type import MAX_HORIZONTAL_SIGMA_M
 from terrafix.link.pilot_text.statustext import fault_text
 from terrafix.messages import SearchStep
 from terrafix_tools.estimates import NS
@@ -32,6 +34,9 @@ from terrafix_tools.report.data import FlightView, radius95_m
 from terrafix_tools.report.text import FIX_3D, GAP_S, UNPLANNED
 
 MAX_MOMENTS = 10
+LARGE_ERROR_M = 20.0  # [spec: requirement on the share of the frames within 20 m]
+CHI_95 = math.sqrt(5.991)  # radius of the 95 % ellipse in standard deviations [spec: chi-square, 2 degrees of freedom]
+LARGE_RADIUS_M = CHI_95 * MAX_HORIZONTAL_SIGMA_M
 APART_S = 10.0  # least time between two moments ...
 APART_SHARE = 1 / 20  # ... or this share of a flight, if that is less
 SEARCHING = (SearchStep.WIDEN, SearchStep.WHOLE_MAP, SearchStep.ASK)
@@ -55,11 +60,12 @@ class Moment:
     reasons: dict[str, str] = field(default_factory=dict)
 
 
-def worst_moments(view: FlightView) -> list[Moment]:
-    """Returns at most MAX_MOMENTS, in order of time."""
+def worst_moments(view: FlightView, *, trusted: bool = False) -> list[Moment]:
+    """Returns at most MAX_MOMENTS, in order of time; none of a flight in which nothing was bad. ``trusted``: the
+    verdict on the flight."""
     apart_s = min(APART_S, APART_SHARE * view.duration_s)
     found_of = {kind: _worst_first(find(view)) for kind, find in _KINDS.items()}
-    left = {kind: deque(peaks(found, apart_s)) for kind, found in found_of.items()}
+    left = {kind: deque(peaks(found, apart_s)) for kind, found in found_of.items() if kind != "gate" or not trusted}
     times_s = np.array([row.t_s for row in view.rows])
     chosen: list[Moment] = []
 
@@ -106,7 +112,8 @@ def peaks(candidates: Iterable[Candidate], apart_s: float) -> Iterator[Candidate
 def _errors(view: FlightView) -> Iterator[Candidate]:
     for row in view.rows:
         error_m, radius_m = view.error_m(row), radius95_m(row)
-        if error_m is not None:
+        beyond = radius_m is not None and error_m is not None and error_m > 3.0 / CHI_95 * radius_m
+        if error_m is not None and (error_m > LARGE_ERROR_M or beyond):
             stated = f", stated 95 % radius {radius_m:.1f} m" if radius_m is not None else ""
             yield Candidate(row.t_s, error_m, f"Error {error_m:.1f} m against the truth{stated}")
 
@@ -148,7 +155,8 @@ def _links(view: FlightView) -> Iterator[Candidate]:
 
 def _radii(view: FlightView) -> Iterator[Candidate]:
     for row in view.rows:
-        if (radius_m := radius95_m(row)) is not None:
+        radius_m = radius95_m(row)
+        if radius_m is not None and radius_m > LARGE_RADIUS_M:
             yield Candidate(row.t_s, radius_m, f"Stated 95 % radius {radius_m:.1f} m")
 
 

@@ -2,8 +2,11 @@
 
 from pathlib import Path
 
+from markupsafe import Markup
+
 from terrafix_tools.estimates import Row
 from terrafix_tools.flight_map import map_of_flight
+from terrafix_tools.flight_verdict import FlightVerdict
 from terrafix_tools.pages.charts import clock, stamp
 from terrafix_tools.pages.document import kit, macros, write_file
 from terrafix_tools.report.data import FlightView, radius95_m
@@ -17,7 +20,7 @@ from terrafix_tools.report.sections_gnss import gnss
 from terrafix_tools.report.sections_innovations import innovations
 from terrafix_tools.report.sections_moments import moments_sections
 from terrafix_tools.report.sections_run import camera_images, finalised, picture_rows, provenance, timing
-from terrafix_tools.report.text import events
+from terrafix_tools.report.text import events, verdict_of
 from terrafix_tools.report.text import figures as key_figures
 
 OWN = macros("terrafix_tools/report.html")
@@ -42,7 +45,8 @@ def report(folder: Path, truth_path: Path | None = None, map_path: Path | None =
 
 
 def _page(view: FlightView, map_path: Path | None) -> str:
-    moments = worst_moments(view)
+    verdict = verdict_of(view)
+    moments = worst_moments(view, trusted=verdict.is_trusted)
     pointed = pointed_rows(view, moments)
     worst, details = moments_sections(view, moments, map_path)
     sections = [
@@ -50,21 +54,32 @@ def _page(view: FlightView, map_path: Path | None) -> str:
         _events(view),
         worst,
         accuracy(view),
-        finalised(view),
         states(view),
-        innovations(view),
-        verdicts(view),
-        rejected_map_matches(view),
-        link(view),
-        gnss(view),
-        timing(view),
-        computer(view),
-        details,
-        camera_images(view),
-        provenance(view),
+        *map(
+            _folded,
+            (
+                finalised(view),
+                innovations(view),
+                verdicts(view),
+                rejected_map_matches(view),
+                link(view),
+                gnss(view),
+                timing(view),
+                computer(view),
+                details,
+                camera_images(view),
+                provenance(view),
+            ),
+        ),
     ]
     frames = [{"i": i, "t": round(view.rows[i].t_s, 3), "h": _tip(view, view.rows[i])} for i in pointed]
-    return kit.document(f"{view.title} - flight report", OWN.pointed(frames), *_head(view), *sections)
+    return kit.document(f"{view.title} - flight report", OWN.pointed(frames), *_head(view, verdict), *sections)
+
+
+def _folded(section: str) -> str:
+    """A section of which only the heading is seen until it is opened."""
+    head, end, rest = section.partition("</h2>")
+    return OWN.folded(Markup(head + end), Markup(rest)) if end else section
 
 
 def pointed_rows(view: FlightView, moments: list[Moment]) -> list[int]:
@@ -74,7 +89,7 @@ def pointed_rows(view: FlightView, moments: list[Moment]) -> list[int]:
     return sorted(chosen)
 
 
-def _head(view: FlightView) -> tuple[str, str]:
+def _head(view: FlightView, verdict: FlightVerdict) -> tuple[str, ...]:
     kind = "live record" if view.live else "replay, unfinished" if view.unfinished else "replay"
     named = view.summary.get("map", {})
     facts = [
@@ -83,7 +98,15 @@ def _head(view: FlightView) -> tuple[str, str]:
         ", ".join(view.summary.get("models", {})) or ("" if view.live else "no learned model"),
     ]
     line = " · ".join(fact for fact in facts if fact)
-    return kit.header(f"Terrafix flight report, {kind}", view.title, line), kit.figures(key_figures(view))
+    mood = "good" if verdict.is_trusted else "fair" if verdict.spans else "bad"
+    shown = key_figures(view)
+    colours = "Green: as the requirements ask; amber: less; red: far less; no colour: not rated."
+    return (
+        kit.header(f"Terrafix flight report, {kind}", view.title, line),
+        OWN.verdict(verdict.text(), mood),
+        kit.figures(shown),
+        kit.quiet(colours) if any(one.mood for one in shown) else "",
+    )
 
 
 def _map_section(view: FlightView, map_path: Path | None, moments: list[Moment], pointed: list[int]) -> str:

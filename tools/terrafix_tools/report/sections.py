@@ -30,11 +30,12 @@ def accuracy(view: FlightView) -> str:
     error_values = [v for _, v in errors if v is not None]
     if not error_values:
         return _reported_only(view, reported, max(values))
-    top = max([*values, *error_values, 60.0]) * 1.15
+    top = max([*values, *error_values, 2.0 * ERROR_FLOOR_M]) * 1.15
     chart = Chart(x_max=end_s(view), y_min=ERROR_FLOOR_M, y_max=top, height=330, log_y=True)
     chart.area(reported, "claim")
     for limit in (20.0, 50.0):
-        chart.level(limit)
+        if limit < top:
+            chart.level(limit)
     chart.line(refined, "refined")
     chart.line(errors, "error")
     chart.line(reported, "claim")
@@ -76,7 +77,7 @@ def _cumulative(view: FlightView) -> str:
     total = len(view.compared)
     immediate = sorted(c.error_m for c in view.compared.values() if c.error_m is not None)
     refined = sorted(c.refined_error_m for c in view.compared.values() if c.refined_error_m is not None)
-    top = max([60.0, *immediate, *refined]) * 1.1
+    top = max([2.0, *immediate, *refined]) * 1.1
     chart = Chart(
         x_min=1.0,
         x_max=top,
@@ -91,7 +92,8 @@ def _cumulative(view: FlightView) -> str:
     )
     for i, limit in enumerate((20.0, 50.0)):
         share = 100 * sum(e <= limit for e in immediate) / total
-        chart.vertical_line(limit, f"{share:.1f} % within {limit:.0f} m", row=12 - i)
+        if limit < top:
+            chart.vertical_line(limit, f"{share:.1f} % within {limit:.0f} m", row=12 - i)
     for errors, css in ((refined, "refined"), (immediate, "error")):
         steps: list[Point] = [(max(1.0, e), 100 * (i + 1) / total) for i, e in enumerate(errors)]
         chart.line([*steps, (top, 100 * len(errors) / total)] if steps else [], css)
@@ -159,7 +161,12 @@ def verdicts(view: FlightView) -> str:
     matched = sum(view.matched_by.values())
     shares = [f"{by} {100 * n / matched:.0f} %" for by, n in sorted(view.matched_by.items())]
     by = f" Frames matched with the map by: {', '.join(shares)}." if shares else ""
-    return kit.section("Verdicts", f"Verdicts per measurement; rejected ones by reason.{by}", kit.two(*blocks))
+    return kit.section(
+        "Verdicts",
+        f"Verdicts per measurement; rejected ones by reason.{by}",
+        kit.two(*blocks),
+        kit.legend([("k-sat", "accepted"), ("k-dead", "rejected")]),
+    )
 
 
 def rejected_map_matches(view: FlightView) -> str:

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 
-from terrafix.link.gnss.spoofing_detector import AGREEMENT_SIGMAS
+from terrafix.link.gnss.spoofing_detector import GNSS_AGREEMENT_SIGMAS
 from terrafix.messages import GnssReading, GnssVerdict
 from terrafix_tools.pages.charts import Band, Chart, Point, stamp, strips
 from terrafix_tools.pages.document import kit
@@ -49,7 +49,7 @@ def gnss(view: FlightView) -> str:
             strips(bands, end, "State of the receivers over time"),
             kit.legend(keys),
             _chart("Distance from the estimate", "m", distances, end, None),
-            _chart("The same in standard deviations of both", "", sigmas, end, AGREEMENT_SIGMAS),
+            _chart("The same in standard deviations of both", "", sigmas, end, GNSS_AGREEMENT_SIGMAS),
         ),
         _changes(states),
     )

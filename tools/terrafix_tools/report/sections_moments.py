@@ -18,7 +18,8 @@ OWN = macros("terrafix_tools/report.html")
 AROUND_S = 1.0  # `terrafix log show` of a moment: this much before and after it
 RULE = (
     "Chosen by what the record says, in turns: longest loss of the fix, faults, links and processes lost, largest "
-    "error (if there is truth), measurements farthest beyond their gate, largest stated 95 % radius."
+    "error (if there is truth: above 20 m, or beyond 3 sigma), measurements farthest beyond their gate, stated 95 % "
+    "radius above 122 m. Of a flight that can be trusted rejected measurements alone are no moment."
 )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.link.pilot_text.statustext import fault_text
-from terrafix_tools.flight_verdict import flight_verdict
+from terrafix_tools.flight_verdict import FlightVerdict, flight_verdict
 from terrafix_tools.lens_report import lens_words
 from terrafix_tools.pages.document import Figure
 from terrafix_tools.report.data import FlightView, radius95_m
@@ -77,6 +77,13 @@ def figures(view: FlightView) -> list[Figure]:
     return shown
 
 
+def verdict_of(view: FlightView) -> FlightVerdict:
+    """The verdict on the whole flight, with the likely cause of the replay where there is one."""
+    verdict = flight_verdict(view.rows, view.faults, view.verdicts)
+    cause = view.summary.get("verdict", {}).get("cause", "") if verdict.cause else ""
+    return replace(verdict, cause=cause) if cause else verdict
+
+
 def _share(name: str, value: float, good: float, fair: float) -> Figure:
     digits = 0 if value in (0.0, 1.0) else 1
     return Figure(
@@ -89,12 +96,10 @@ def events(view: FlightView) -> list[tuple[float | None, str]]:
     entries: list[tuple[float | None, str]] = []
     entries += _positions(view) + _anchors(view) + _errors(view) + _gps(view)
     entries += [(t_s, f"{fault_text(fault).capitalize()}: {fault.detail}.") for t_s, fault in view.faults]
-    verdict = flight_verdict(view.rows, view.faults, view.verdicts)
-    cause = view.summary.get("verdict", {}).get("cause", "") if verdict.cause else ""
-    entries.append((None, f"Verdict: {(replace(verdict, cause=cause) if cause else verdict).text()}"))
     lens = lens_words(view.origin.camera, view.calibration) if view.origin and view.calibration else None
     if lens is not None:
         entries.append((None, lens))
+    entries += [(None, f"Camera: {words}.") for words in view.camera_times.words()]
     for t_s, event in view.events:
         if event.event in UNPLANNED or event.event == "restarted":
             detail = f" ({event.detail})" if event.detail else ""

@@ -11,6 +11,7 @@ import numpy as np
 from terrafix.core.errors import SourceError
 from terrafix.messages import (
     EkfDeadReckoning,
+    Fact,
     Frame,
     GimbalAttitude,
     GnssInitialPosition,
@@ -60,6 +61,9 @@ class RecordedFrames:
     def map_hint(self) -> Path | None:
         path = self.header.get("map", {}).get("path", "") or self.header["config"].get("map", {}).get("path", "")
         return Path(path) if path else None
+
+    def facts(self) -> list[Fact]:
+        return [Fact(*fact) for fact in self.header.get("source", [])]
 
     def close(self) -> None:
         """No resource stays open between shots."""

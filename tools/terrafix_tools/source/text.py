@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 
-from terrafix.vision.sources.facts import Fact
+from terrafix.messages import Fact
 
 
 def fact_lines(name: str, facts: Iterable[Fact]) -> Iterator[str]:

@@ -13,6 +13,7 @@ from terrafix.messages import (
     NavEstimate,
     PositionSource,
     SearchState,
+    SourceFacts,
     ThermalReading,
 )
 from terrafix_tools.report.sections_autopilot import EKF_POS_HORIZ_ABS
@@ -26,8 +27,10 @@ SILENT_S = (
 
 
 def facts(status: Status, processes: list[ProcessState], now_ns: int) -> dict[str, Any]:
-    """-> position, autopilot, processes, rates, computer and log; None: not known (yet)."""
+    """-> source, position, autopilot, processes, rates, computer and log; None: not known (yet)."""
+    source = status.last(SourceFacts)
     return {
+        "source": None if source is None else [fact._asdict() for fact in source.facts],
         "position": _position(status, now_ns),
         "autopilot": _autopilot(status, now_ns),
         "processes": [_process(status, process) for process in processes],

@@ -23,6 +23,7 @@ from terrafix.messages import (
     PositionSource,
     ProcessEvent,
     SearchState,
+    SourceFacts,
     StatusText,
     ThermalReading,
     Verdict,
@@ -30,6 +31,7 @@ from terrafix.messages import (
 
 # What is read from the bus.
 KINDS: tuple[type[Message], ...] = (
+    SourceFacts,
     Frame,
     Odometry,
     MapMatch,

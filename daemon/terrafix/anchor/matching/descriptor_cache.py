@@ -10,8 +10,8 @@ from terrafix.anchor.matching.descriptor_store import DescriptorStore
 TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride [tuned]
 # pixels of context around a tile, so that descriptors at its border equal those of a larger image; a multiple of every
 # stride [tuned]
-PAD_PX = 32
-CACHE_BYTES = 33 * 1024 * 1024  # memory for the tiles of all layers, bytes: 31 tiles of gradients [tuned]
+TILE_PAD_PX = 32
+DESCRIPTOR_CACHE_BYTES = 33 * 1024 * 1024  # memory for the tiles of all layers, bytes: 31 tiles of gradients [tuned]
 # A float16 of the same sign, exponent and mantissa, moved to where a float32 has them: the sign has come with it in too
 # many copies, and the exponent is less than it should be by the difference of the two biases. [spec: IEEE 754]
 _MANTISSA_SHIFT, _SIGN_ONCE, _EXPONENT_BIASES = 23 - 10, np.int32(-0x70000001), np.float32(2.0 ** (127 - 15))
@@ -37,7 +37,6 @@ class Describer(Protocol):
 
     def describe(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR -> (C, H // stride, W // stride) float32"""
-        ...
 
 
 class MapFeatures:
@@ -45,8 +44,8 @@ class MapFeatures:
         self,
         source: MapWindows,
         describer: Describer,
-        cache_bytes: int = CACHE_BYTES,
-        pad_px: int = PAD_PX,
+        cache_bytes: int = DESCRIPTOR_CACHE_BYTES,
+        pad_px: int = TILE_PAD_PX,
         store: DescriptorStore | None = None,
     ) -> None:
         """``store``: file store in which tiles outlive this process."""

@@ -14,8 +14,8 @@ import numpy as np
 
 from terrafix.runtime.checkpoint import CheckpointFile
 
-# Tiles of all layers together, 1.1 MB each: more than the matcher keeps for itself (CACHE_BYTES), which are those that
-# a process started in its place needs. A flight around one place uses about 20. [tuned]
+# Tiles of all layers together, 1.1 MB each: more than the matcher keeps (DESCRIPTOR_CACHE_BYTES), those which a
+# process started in its place needs. A flight around one place uses about 20. [tuned]
 MAX_TILES = 48
 
 

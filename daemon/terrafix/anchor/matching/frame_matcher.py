@@ -10,20 +10,20 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, Describer, MapFeatures
+from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Rectified, patch_centres, rectify
-from terrafix.anchor.matching.patch_matcher import match_patches
+from terrafix.anchor.matching.patch_matcher import SearchedMap, match_patches
 from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_SLOPE, BELIEF_LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
 from terrafix.core.pnp import (
-    CUTOFF,
-    INDEPENDENT_SHARE,
+    INDEPENDENT_MATCH_SHARE,
     INLIER_THRESHOLD,
     PNP_MIN_INLIERS,
+    POSE_CUTOFF,
     SEARCH_RADIUS,
     PnpResult,
     solve,
@@ -176,7 +176,7 @@ class FrameMatcher:
         camera: CameraCalibration,
         source: LocalMap,
         describer: Describer,
-        cache_bytes: int = CACHE_BYTES,
+        cache_bytes: int = DESCRIPTOR_CACHE_BYTES,
         store: DescriptorStore | None = None,
         drawn: bool = False,
         correlator: GraphCorrelator | None = None,
@@ -331,11 +331,10 @@ class FrameMatcher:
         e_min, n_max = view.e_m + frame.e_min_m - margin, view.n_m + frame.n_max_m + margin
         width, height = mask.shape[1] + 2 * radius + 4, mask.shape[0] + 2 * radius + 4
         features = self.gradient_features if describer is self.gradients else self._features
-        window, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
+        cells, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
+        searched = SearchedMap(cells, valid, (e_min, n_max))
         centres = patch_centres(self.camera, view.r_w_c, view.agl_m, frame, cell, PATCH_STEP)
-        found = match_patches(
-            template, frame, mask, cell, window, valid, (e_min, n_max), (view.e_m, view.n_m), patch, radius, centres
-        )
+        found = match_patches(template, frame, mask, cell, searched, (view.e_m, view.n_m), patch, radius, centres)
         rays = np.column_stack([found.frame_m, np.full(len(found.frame_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
         up = self._map.elevation(found.map_m[:, 0], found.map_m[:, 1]) if len(xy) else None
@@ -365,12 +364,7 @@ class FrameMatcher:
     def _extent(self, frame: Rectified) -> tuple[float, float, float, float]:
         """Extent of a rectified frame relative to the nadir, metres: e_min, n_max, e_max, n_min."""
         h, w = frame.mask.shape
-        return (
-            frame.e_min_m,
-            frame.n_max_m,
-            frame.e_min_m + w * frame.gsd_m,
-            frame.n_max_m - h * frame.gsd_m,
-        )
+        return (frame.e_min_m, frame.n_max_m, frame.e_min_m + w * frame.gsd_m, frame.n_max_m - h * frame.gsd_m)
 
 
 def view_at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:
@@ -390,7 +384,7 @@ def levelled_view(view: View, fix: PatchFix) -> View:
     """``view_of_fix``, with the tilt that was predicted as a prior. A dozen patches leave the tilt to some degrees, and
     the position to as much of the height: a frame rectified by them alone would be another one for each patch more."""
     assert fix.pnp.fit is not None and fix.given is not None
-    agrees = fix.weights * biweight(fix.pnp.fit.residuals, CUTOFF * fix.given.threshold)
+    agrees = fix.weights * biweight(fix.pnp.fit.residuals, POSE_CUTOFF * fix.given.threshold)
     r_w_c, p_m = view.r_w_c, fix.pnp.fit.p_c_in_w_m
     fit = fit_pose(
         fix.points_w_m,
@@ -399,7 +393,7 @@ def levelled_view(view: View, fix: PatchFix) -> View:
         p_m,
         fix.given.sigma_floor,
         agrees,
-        INDEPENDENT_SHARE,
+        INDEPENDENT_MATCH_SHARE,
         tilt_sigma_rad=view.tilt_sigma_rad,
     )
     return view_of_fix(view, fix if fit is None else replace(fix, pnp=replace(fix.pnp, fit=fit)))

@@ -10,7 +10,7 @@ and the mean difference of the scores is estimated.
 import math
 from collections.abc import Mapping, Sequence
 
-MIN_PAIRS = 3.0  # paired observations (full new ground) of a layer before it may replace the one in use [tuned]
+MIN_LAYER_PAIRS = 3.0  # paired observations (full new ground) of a layer before it may replace the one in use [tuned]
 # mean difference of the standardised correlation that a replacement needs; frames at the right place score 3 to 10
 # [tuned]
 MIN_SCORE_LEAD = 0.5
@@ -18,8 +18,8 @@ MIN_SCORE_LEAD = 0.5
 DIFFERENCE_SIGMA = 1.0
 MAX_WEIGHT_SUM = 10.0  # effective number of observations in the mean; the ground changes along the flight [tuned]
 PROBE_INTERVAL = 8.0  # observations between two pairs once every layer has been tried [tuned]
-# standardised correlation below which the layer in use may be the cause, so that another one is tried with every frame
-# [tuned]
+# Standardised correlation at the mode below which the layer in use may be the cause, so that another one is tried with
+# every frame; a frame at the right place has 3 to 10. [tuned]
 POOR_SCORE = 2.0
 
 
@@ -44,8 +44,8 @@ class LayerSelector:
         if not others:
             return (self.best,)
         table, least = min(others.items(), key=lambda item: item[1].weight_sum)  # ties: the first one
-        due = least.weight_sum < MIN_PAIRS or self._poor or self._since_pair >= PROBE_INTERVAL
-        if due and least.weight_sum >= MIN_PAIRS:  # all have enough pairs: take the one that was tried longest ago
+        due = least.weight_sum < MIN_LAYER_PAIRS or self._poor or self._since_pair >= PROBE_INTERVAL
+        if due and least.weight_sum >= MIN_LAYER_PAIRS:  # all have enough pairs: the one that was tried longest ago
             table = max(others, key=lambda name: others[name].age)
         return (self.best, table) if due else (self.best,)
 
@@ -95,6 +95,6 @@ class _Difference:
     def is_better(self) -> bool:
         """Whether the mean exceeds ``MIN_SCORE_LEAD`` by one standard error. A change of layers also changes the
         position error of the map."""
-        return self.weight_sum >= MIN_PAIRS and self.mean > MIN_SCORE_LEAD + DIFFERENCE_SIGMA / math.sqrt(
+        return self.weight_sum >= MIN_LAYER_PAIRS and self.mean > MIN_SCORE_LEAD + DIFFERENCE_SIGMA / math.sqrt(
             self.weight_sum
         )

@@ -3,14 +3,14 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, Describer
+from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, Describer
 from terrafix.anchor.matching.descriptor_store import MAX_TILES, DescriptorStore
 from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher, View
 from terrafix.anchor.matching.layer_selector import LayerSelector
 from terrafix.anchor.matching.point_mass_filter import Belief, Mode
 from terrafix.anchor.place_index.recognizer import PlaceMemory, PlaceRecognizer
 from terrafix.anchor.verification.consensus_pose import ConsensusPose
-from terrafix.core.camera import CameraCalibration
+from terrafix.core.camera import CameraCalibration, Readout
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
 from terrafix.map.format import DRAWN_TABLE, accuracy_of
@@ -63,7 +63,7 @@ class MapLayers:
                 store = DescriptorStore(
                     store_folder, f"{_file_identity(package)} {frame} {layer.table}", MAX_TILES // len(layers)
                 )
-            cache_bytes = CACHE_BYTES // len(layers)
+            cache_bytes = DESCRIPTOR_CACHE_BYTES // len(layers)
             matcher = FrameMatcher(camera, bound, describer, cache_bytes, store, layer.is_drawn, correlator)
             sigma_m = accuracy_of(layer, ce90_m).sigma_m
             recognizer = None
@@ -75,10 +75,11 @@ class MapLayers:
             )
         self._selector = LayerSelector([layer.table for layer in layers], DRAWN_TABLE)
 
-    def set_distortion(self, radial_k1: float) -> None:
-        """Sets the distortion of the division model in all matchers, from the estimator's self-calibration."""
+    def set_lens(self, radial_k1: float, readout: Readout | None) -> None:
+        """Sets the distortion of the division model in all matchers, from the estimator's self-calibration, and the
+        rolling shutter of the frame."""
         for layer in self._all.values():
-            layer.matcher.camera = replace(layer.matcher.camera, radial_k1=radial_k1)
+            layer.matcher.camera = replace(layer.matcher.camera, radial_k1=radial_k1, readout=readout)
 
     @property
     def best(self) -> MapLayer:

@@ -13,7 +13,7 @@ from terrafix.core.node import Image
 # heights: ground farther than this from the nadir (58 degrees) is seen too obliquely to be matched [tuned]
 MAX_GROUND_DISTANCE = 1.6
 # smallest cosine between optical axis and vertical: that limit with a margin for the image corners [tuned]
-MIN_DOWN = 0.3
+MIN_AXIS_DOWN = 0.3
 # Pixels of the rectified image between two that a lens with distortion is evaluated for; between them it is
 # interpolated, to a twentieth of a rectified pixel for a k1 of -0.2. [measured: test_orthorectify]
 LENS_STEP_PX = 4
@@ -38,7 +38,7 @@ def footprint(camera: CameraCalibration, r_w_c: np.ndarray, agl_m: float) -> tup
     w, h = camera.width - 1.0, camera.height - 1.0
     rim = [(x * w, y * h) for x, y in ((0, 0), (0.5, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.5))]
     rays = np.column_stack([camera.normalise(np.array(rim)), np.ones(len(rim))]) @ r_w_c.T
-    if float(r_w_c[2, 2]) > -MIN_DOWN:  # the optical axis is too close to the horizon
+    if float(r_w_c[2, 2]) > -MIN_AXIS_DOWN:  # the optical axis is too close to the horizon
         return None
     ground = rays[:, :2] / np.maximum(-rays[:, 2:], 1e-3) * agl_m
     ground = np.clip(ground, -MAX_GROUND_DISTANCE * agl_m, MAX_GROUND_DISTANCE * agl_m)
@@ -74,7 +74,7 @@ def rectify(
         if shrink not in blurred:
             blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
         source = blurred[shrink]
-    if camera.distortion or camera.radial_k1:
+    if camera.distortion or camera.radial_k1 or camera.readout is not None:
         px = _lens_map(camera, to_camera, width, height)
         flat = cv2.remap(source, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
         mask = (px >= 0).all(-1) & (px[..., 0] <= camera.width - 1) & (px[..., 1] <= camera.height - 1)
@@ -98,7 +98,7 @@ def patch_centres(
     (left, top), (right, bottom) = np.ceil(corners.min(axis=0) / step), np.floor(corners.max(axis=0) / step) + 1.0
     y, x = (axis.ravel() * step for axis in np.mgrid[top:bottom, left:right])
     rays = np.column_stack([x, y, np.ones(len(x))]) @ r_w_c.T
-    rays = rays[rays[:, 2] < -MIN_DOWN]
+    rays = rays[rays[:, 2] < -MIN_AXIS_DOWN]
     ground_m = rays[:, :2] / -rays[:, 2:] * agl_m
     return np.column_stack([frame.n_max_m - ground_m[:, 1], ground_m[:, 0] - frame.e_min_m]) / cell_m
 

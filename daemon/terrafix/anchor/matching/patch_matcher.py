@@ -14,7 +14,7 @@ MAX_PATCHES = 48  # patches per frame [tuned]
 LEAST_INSIDE = 0.96  # [spec: two of the 50 cells of its side are outside]
 # Share from which a patch has its full weight by having more texture than the first that is left out
 MORE_TEXTURE = 0.05  # [spec: 1 % of the texture changes a weight by a fifth]
-MIN_CORRELATION = 0.2  # correlation at the peak below which a patch is rejected as noise [tuned]
+MIN_PATCH_CORRELATION = 0.2  # correlation at the peak below which a patch is rejected as noise [tuned]
 # standard deviations of the patch's surface between the peak and the second peak; less is ambiguous [tuned]
 MIN_MARGIN = 0.35
 # From these a peak has its full weight: correlation, and margin in MIN_MARGIN; between them and the least ones the
@@ -35,28 +35,36 @@ class PatchMatches:
     weight: np.ndarray
 
 
+@dataclass(frozen=True)
+class SearchedMap:
+    """``cells`` (C, H, W) and ``valid`` (H, W) describe the map from its corner ``corner_m`` (e_min, n_max) on."""
+
+    cells: np.ndarray
+    valid: np.ndarray
+    corner_m: tuple[float, float]
+
+
 def match_patches(
     template: np.ndarray,
     rectified: Rectified,
     cells_mask: np.ndarray,
     cell_m: float,
-    window: np.ndarray,
-    valid: np.ndarray,
-    window_corner_m: tuple[float, float],
+    searched: SearchedMap,
     camera_m: tuple[float, float],
     patch_cells: int,
     radius_cells: int,
     centres: np.ndarray | None = None,
 ) -> PatchMatches:
-    """``template`` (C, h, w) and ``cells_mask`` (h, w) describe the rectified frame; ``window`` (C, H, W) and ``valid``
-    (H, W) the map, with its corner at (e_min, n_max). ``camera_m``: predicted east and north of the camera. Each patch
-    is searched within ``radius_cells`` of its predicted place. ``centres``: as in ``correlate_patches``."""
+    """``template`` (C, h, w) and ``cells_mask`` (h, w) describe the rectified frame. ``camera_m``: predicted east and
+    north of the camera. Each patch is searched within ``radius_cells`` of its predicted place. ``centres``: as in
+    ``correlate_patches``."""
     # Cell of the window at which the template's corner is expected.
-    row0_exact = (window_corner_m[1] - (camera_m[1] + rectified.n_max_m)) / cell_m
-    column0_exact = ((camera_m[0] + rectified.e_min_m) - window_corner_m[0]) / cell_m
+    e_min_m, n_max_m = searched.corner_m
+    row0_exact = (n_max_m - (camera_m[1] + rectified.n_max_m)) / cell_m
+    column0_exact = ((camera_m[0] + rectified.e_min_m) - e_min_m) / cell_m
     row0, column0 = round(row0_exact), round(column0_exact)
     corners, shares, surfaces = correlate_patches(
-        template, cells_mask, window, valid, patch_cells, radius_cells, row0, column0, centres
+        template, cells_mask, searched.cells, searched.valid, patch_cells, radius_cells, row0, column0, centres
     )
     peaks = _peaks(surfaces, np.array([row0_exact - row0, column0_exact - column0]))
     half = patch_cells / 2.0
@@ -64,7 +72,7 @@ def match_patches(
     found = places + np.array([row0, column0]) - radius_cells + peaks.place
     return PatchMatches(
         np.column_stack([rectified.e_min_m + places[:, 1] * cell_m, rectified.n_max_m - places[:, 0] * cell_m]),
-        np.column_stack([window_corner_m[0] + found[:, 1] * cell_m, window_corner_m[1] - found[:, 0] * cell_m]),
+        np.column_stack([e_min_m + found[:, 1] * cell_m, n_max_m - found[:, 0] * cell_m]),
         peaks.weight * shares[peaks.index],
     )
 
@@ -217,14 +225,14 @@ def _peaks(surfaces: np.ndarray, expected: np.ndarray) -> _Peaks:
     margin = best - elsewhere.max(axis=(1, 2))
     is_inside = (np.minimum(r, c) > 0) & (np.maximum(r, c) < n - 1)
     clear = margin / np.maximum(MIN_MARGIN * surfaces.std(axis=(1, 2)), 1e-9)
-    index = np.flatnonzero(is_inside & (best >= MIN_CORRELATION) & (clear >= 1.0))
+    index = np.flatnonzero(is_inside & (best >= MIN_PATCH_CORRELATION) & (clear >= 1.0))
     i, r, c, best = index, r[index], c[index], best[index].astype(float)
     rows = r + _vertex(surfaces[i, r - 1, c], best, surfaces[i, r + 1, c])
     columns = c + _vertex(surfaces[i, r, c - 1], best, surfaces[i, r, c + 1])
     place = np.column_stack([rows, columns])
     to_border = (n // 2 - 1.5 - np.abs(place - n // 2 - expected)) / BORDER_CELLS
     fade = np.clip((clear[i] - 1.0) / (FULL_MARGIN - 1.0), 0.0, 1.0)
-    fade *= np.clip((best - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION), 0.0, 1.0)
+    fade *= np.clip((best - MIN_PATCH_CORRELATION) / (FULL_CORRELATION - MIN_PATCH_CORRELATION), 0.0, 1.0)
     fade *= np.clip(to_border, 0.0, 1.0).prod(axis=1)
     used = fade > 0.0
     return _Peaks(i[used], place[used], (best**2 * fade)[used])

@@ -20,7 +20,7 @@ BELIEF_LLR_MIN, BELIEF_LLR_MAX = -3.0, 9.0  # bounds of the log likelihood ratio
 # share of the mass that a full observation redistributes uniformly over the window, so that no position is excluded
 # [tuned]
 LEAK = 0.004
-CELL_PER_AGL = 1 / 50  # belief cell as a share of the height: 2 m at 100 m, two cells of the correlation [tuned]
+BELIEF_CELL_PER_AGL = 1 / 50  # belief cell as a share of the height: 2 m at 100 m, two cells of the correlation [tuned]
 MIN_CELL_M = 1.0  # metres [tuned]
 # smallest half width of the window, cells, so that the next position error still lies inside [tuned]
 MIN_HALF_CELLS = 60
@@ -32,7 +32,7 @@ MODE_RADIUS_CELLS = 7  # radius around a peak whose mass is one mode [tuned]
 
 def belief_cell_m(agl_m: float, correlation_cell_m: float) -> float:
     """Size of a belief cell in metres, in octaves: a share of the height, not finer than the correlation's cells."""
-    wanted = max(agl_m * CELL_PER_AGL, correlation_cell_m, MIN_CELL_M)
+    wanted = max(agl_m * BELIEF_CELL_PER_AGL, correlation_cell_m, MIN_CELL_M)
     return float(2.0 ** round(np.log2(wanted)))
 
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from terrafix.core.errors import MapError
 
-VERSION = 1  # another version is refused [spec: of this page]
-HEADER, VECTORS, POSITIONS, FAISS = "header.json", "vectors.npy", "positions.npy", "ivf.faiss"
+INDEX_VERSION = 1  # another version is refused [spec: of this page]
+HEADER_FILE, VECTORS, POSITIONS, FAISS = "header.json", "vectors.npy", "positions.npy", "ivf.faiss"
 DEGREES = 1e-7  # unit of the positions [spec: MAVLink degE7]
 BLOCK_BYTES = 1 << 20  # [spec: 1 MiB]
 
@@ -61,15 +61,15 @@ def read_header(folder: Path, *, verify: bool) -> Header:
     completely. Raises MapError."""
     again = "make it again: terrafix map index"
     try:
-        header = msgspec.json.decode((folder / HEADER).read_bytes(), type=Header)
+        header = msgspec.json.decode((folder / HEADER_FILE).read_bytes(), type=Header)
     except FileNotFoundError:
-        raise MapError(f"{folder}: no place index ({HEADER} is missing); {again}") from None
+        raise MapError(f"{folder}: no place index ({HEADER_FILE} is missing); {again}") from None
     except OSError as error:
         raise MapError(f"{folder}: cannot be read ({error.strerror}); check path and permissions") from None
     except msgspec.DecodeError as error:
-        raise MapError(f"{folder / HEADER}: damaged ({error}); {again}") from None
-    if header.version != VERSION:
-        raise MapError(f"{folder}: place index of version {header.version}, not {VERSION}; {again}")
+        raise MapError(f"{folder / HEADER_FILE}: damaged ({error}); {again}") from None
+    if header.version != INDEX_VERSION:
+        raise MapError(f"{folder}: place index of version {header.version}, not {INDEX_VERSION}; {again}")
     for name, expected in header.files.items():
         if file_of(folder / name, hashed=verify) not in (expected, File(size_bytes=expected.size_bytes, sha256="")):
             raise MapError(f"{folder / name}: altered or incomplete; copy it again, or {again}")

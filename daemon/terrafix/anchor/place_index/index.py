@@ -35,7 +35,6 @@ class Backend(Protocol):
         """``queries`` (Q, D) float32 unit vectors; ``allowed`` (N,) bool: the vectors that are searched, None: all.
 
         -> scalar products (Q, count), best first, and ids (Q, count); -inf and -1 where there are fewer."""
-        ...
 
 
 @dataclass(frozen=True)

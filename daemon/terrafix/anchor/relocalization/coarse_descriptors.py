@@ -14,7 +14,7 @@ from terrafix.map.package import LocalMap
 
 # pixels of context of a tile: gradients and their blur reach six pixels; small, because a whole map has many tile
 # borders [tuned]
-PAD_PX = 8
+COARSE_TILE_PAD_PX = 8
 # largest distance in octaves between the wanted scale and a stored one; beyond it descriptors are computed [tuned]
 MAX_OCTAVES = 0.6
 
@@ -23,7 +23,7 @@ class CoarseDescriptors:
     """Same interface as ``MapFeatures``, for pixel sizes from ``gsd_m(wanted)`` only."""
 
     def __init__(self, source: MapWindows, describer: Describer) -> None:
-        self._computed = MapFeatures(source, describer, pad_px=PAD_PX)
+        self._computed = MapFeatures(source, describer, pad_px=COARSE_TILE_PAD_PX)
         self._stored = source.descriptors(describer.name) if isinstance(source, LocalMap) else None
 
     def gsd_m(self, wanted_m: float) -> float:

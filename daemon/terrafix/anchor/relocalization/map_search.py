@@ -34,8 +34,8 @@ from terrafix_engines.runtime import ModelRunError
 # Cells and number of hypotheses up to which dense gradients on small cells are used; they discriminate best. With more
 # hypotheses or a larger map, gradients pooled over larger cells are used: they tolerate yaw errors of some degrees.
 # [measured: docs/search.md]
-FINE_CELL_PER_AGL, FINE_HYPOTHESES = 1 / 50, 25
-CELL_PER_AGL = 1 / 20  # pooled cell as a share of the height [measured: docs/search.md]
+SEARCH_CELL_PER_AGL, FINE_HYPOTHESES = 1 / 50, 25
+POOLED_CELL_PER_AGL = 1 / 20  # pooled cell as a share of the height [measured: docs/search.md]
 # Largest cells x yaws x scales of one joint correlation, about 2 s of one core; a larger map is correlated on larger
 # cells [measured: docs/search.md]
 MAX_WORK = 35e6
@@ -226,13 +226,13 @@ class MapSearch:
         self._hypotheses = self._matcher.map_search_hypotheses(view)
         e_min, n_min, e_max, n_max = self._map.bounds_m
         places_m2 = (e_max - e_min) * (n_max - n_min) * len(self._hypotheses)
-        cell_m = self._matcher.cell_m(view.agl_m, FINE_CELL_PER_AGL)
+        cell_m = self._matcher.cell_m(view.agl_m, SEARCH_CELL_PER_AGL)
         if len(self._hypotheses) <= FINE_HYPOTHESES and places_m2 / cell_m**2 <= MAX_WORK:
             self._correlator = BlockCorrelator(self._map, GradientDescriber())
         else:
             self._correlator = BlockCorrelator(self._map, PooledGradientDescriber())
             stride = self._correlator.stride
-            cell_m = self._correlator.cell_m(stride * self._matcher.cell_m(view.agl_m, CELL_PER_AGL / stride))
+            cell_m = self._correlator.cell_m(stride * self._matcher.cell_m(view.agl_m, POOLED_CELL_PER_AGL / stride))
             if places_m2 / cell_m**2 <= MAX_WORK or not self._index_fits(view):
                 self._recognizer = None
             while places_m2 / cell_m**2 > MAX_WORK and self._recognizer is None:

@@ -11,7 +11,7 @@ import numpy as np
 from terrafix.anchor.matching.frame_matcher import Hypothesis
 from terrafix.anchor.relocalization.block_search import Template
 
-MAX_FRAMES = 8  # frames in a mosaic [tuned]
+MAX_MOSAIC_FRAMES = 8  # frames in a mosaic [tuned]
 MIN_WEIGHT = 0.5  # smallest weight of a cell at the border that belongs to some frame [tuned]
 
 
@@ -36,7 +36,7 @@ class Mosaic:
             frame
             for frame in self._frames
             if var_m2 - frame[1] <= max_sigma_m**2 and np.hypot(*(p_m - frame[0])) <= max_distance_m
-        ][1 - MAX_FRAMES :]
+        ][1 - MAX_MOSAIC_FRAMES :]
         self._frames.append((p_m.copy(), var_m2, templates))
 
     @property

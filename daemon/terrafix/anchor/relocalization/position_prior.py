@@ -12,7 +12,7 @@ from terrafix.messages import Verdict
 # m/s, growth of the prior's radius with its age: the speed that the vehicle may have flown [tuned]
 RADIUS_GROWTH_MPS = 30.0
 # standard deviations of the believed position, beyond the prior's radius, within which both agree [tuned]
-AGREEMENT_SIGMAS = 3.0
+PRIOR_AGREEMENT_SIGMAS = 3.0
 
 # east and north of the south-west corner, then of the north-east corner, local metres
 Bounds = tuple[float, float, float, float]
@@ -65,7 +65,7 @@ def evaluate_prior(
         return PriorDecision(
             Verdict.ACCEPTED, True, distance_m, f"hint accepted, searching within {distance_text(radius_m)}"
         )
-    if distance_m <= radius_m + AGREEMENT_SIGMAS * belief.sigma_m:
+    if distance_m <= radius_m + PRIOR_AGREEMENT_SIGMAS * belief.sigma_m:
         text = f"hint agrees, {distance_text(distance_m)} from the estimate"
         return PriorDecision(Verdict.ACCEPTED, False, distance_m, text)
     if belief.log_odds < START_LOG_ODDS:

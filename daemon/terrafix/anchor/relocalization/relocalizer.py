@@ -16,16 +16,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget
 from terrafix.map.package import LocalMap
-from terrafix.messages import (
-    HintVerdict,
-    MapMatch,
-    MatchPlace,
-    Origin,
-    PositionHint,
-    Prediction,
-    SearchResult,
-    Verdict,
-)
+from terrafix.messages import HintVerdict, MapMatch, MatchPlace, Origin, PositionHint, Prediction, SearchResult, Verdict
 
 LOST_SIGMA_M = 1000.0  # smallest 1-sigma of an unknown position, metres; larger on a larger map [tuned]
 MAX_HEIGHT_RATIO = 1.5  # ratio of heights beyond which a search is restarted [tuned]

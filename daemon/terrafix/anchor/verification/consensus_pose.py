@@ -8,7 +8,7 @@ these may be too few, while the sum of all patch surfaces still shows where most
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, PatchFix, View
 from terrafix.anchor.verification.hypothesis_tracker import TRACK_LLR_MAX, evidence
 from terrafix.anchor.verification.patch_null import PatchNull
-from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, PlaceVerifier
+from terrafix.anchor.verification.place_verifier import PLACE_CELL_PER_AGL, PlaceVerifier
 from terrafix.core.node import Image
 from terrafix.map.package import LocalMap
 
@@ -20,7 +20,7 @@ class ConsensusPose:
     def estimate(self, image: Image, view: View) -> PatchFix | None:
         """``view``: believed position, yaw and height above ground. None: the evidence is below the largest that one
         frame can give. The default null model is used, because no search has estimated one."""
-        first = self._verifier.verify(image, view, CELL_PER_AGL)
+        first = self._verifier.verify(image, view, PLACE_CELL_PER_AGL)
         if first is None or first.fix.pnp.fit is None:
             return None
         if evidence(PatchNull().sigmas(first.consensus, fine=False)) < TRACK_LLR_MAX:

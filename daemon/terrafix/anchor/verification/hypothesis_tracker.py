@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, PatchFix, View
-from terrafix.anchor.verification.patch_consensus import SCALE_SIGMA, YAW_SIGMA_RAD
+from terrafix.anchor.verification.patch_consensus import PATCH_SCALE_SIGMA, YAW_SIGMA_RAD
 from terrafix.anchor.verification.patch_null import PatchNull
-from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_CELL_PER_AGL, PlaceVerifier
+from terrafix.anchor.verification.place_verifier import FINE_PLACE_CELL_PER_AGL, PLACE_CELL_PER_AGL, PlaceVerifier
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.node import Image
 from terrafix.map.package import LocalMap
@@ -165,7 +165,7 @@ class HypothesisTracker:
         # wrong
         if not self.null.is_estimated:
             for track in inactive[: MAX_CHECKS_PER_FRAME - len(tried)]:
-                if (found := self.verifier.verify(image, self._view_at(track, view), CELL_PER_AGL)) is not None:
+                if (found := self.verifier.verify(image, self._view_at(track, view), PLACE_CELL_PER_AGL)) is not None:
                     self.null.add(found.consensus, fine=False)
         self.sigmas = []
         fixes = [(track, self._update_track(track, image, view, path_m)) for track in tried]
@@ -191,7 +191,7 @@ class HypothesisTracker:
         """Updates a track with the frame and moves it to the position that fits best. None: no evidence, or no pose."""
         here = self._view_at(track, view)
         is_strong = track.score > 0.0 or track.lead >= LEADING_SIGMAS
-        found = self.verifier.verify(image, here, FINE_CELL_PER_AGL if is_strong else CELL_PER_AGL)
+        found = self.verifier.verify(image, here, FINE_PLACE_CELL_PER_AGL if is_strong else PLACE_CELL_PER_AGL)
         if found is None:  # too little of the frame lies on the map
             track.update_score(TRACK_LLR_MIN, path_m, view.agl_m)
             return None
@@ -226,7 +226,7 @@ def _mahalanobis2(hypothesis: Hypothesis, view: View) -> float:
     """Squared Mahalanobis distance of yaw and scale from the prediction, with the uncertainty of the prediction and of
     one frame's patches."""
     yaw = hypothesis.yaw_rad / np.hypot(view.yaw_sigma_rad, YAW_SIGMA_RAD)
-    return float(yaw**2 + ((hypothesis.scale - 1.0) / np.hypot(view.scale_sigma, SCALE_SIGMA)) ** 2)
+    return float(yaw**2 + ((hypothesis.scale - 1.0) / np.hypot(view.scale_sigma, PATCH_SCALE_SIGMA)) ** 2)
 
 
 def evidence(z: float) -> float:

@@ -17,11 +17,12 @@ import numpy as np
 # the same, N(0, 1) elsewhere and where it has changed. UNCHANGED_SHARE: prior share of unchanged patches. [tuned]
 UNCHANGED_Z, UNCHANGED_SIGMA, UNCHANGED_SHARE = 2.6, 0.9, 0.5
 MAX_LLR = 3.5  # upper bound of one patch's evidence, nats [tuned]
-INDEPENDENT_SHARE = 0.25  # effective share of independent patches: neighbours overlap by half of their sides [tuned]
+# effective share of independent patches: neighbours overlap by half of their sides [tuned]
+INDEPENDENT_PATCH_SHARE = 0.25
 YAW_RANGE_RAD, YAW_STEPS = np.radians(8.0), 7  # half range of the yaw grid, and its number of values [tuned]
 SCALE_RANGE, SCALE_STEPS = 0.08, 7  # half range of the scale grid, relative, and its number of values [tuned]
 # 1-sigma of the yaw and scale error that a hypothesis of the search leaves [tuned]
-YAW_SIGMA_RAD, SCALE_SIGMA = np.radians(5.0), 0.05
+YAW_SIGMA_RAD, PATCH_SCALE_SIGMA = np.radians(5.0), 0.05
 PATCH_SPREAD = 0.02  # share of the height, 1-sigma of a patch's displacement by relief and leaning buildings [tuned]
 # log weight of a cell by its standardised correlation [spec: a tenth of a sigma below the peak counts half]
 PEAK_SHARPNESS = 6.0
@@ -54,8 +55,8 @@ def estimate_consensus(surfaces: np.ndarray, ground: np.ndarray, cell: float, ti
     llr = _log_likelihood_ratio(z)
     jacobian = _jacobian(ground)
     motion = _grid_search(llr, jacobian, cell)
-    sigma = np.array([np.inf, np.inf, YAW_SIGMA_RAD, SCALE_SIGMA, tilt_sigma_rad, tilt_sigma_rad])
-    information = INDEPENDENT_SHARE / PATCH_SPREAD**2
+    sigma = np.array([np.inf, np.inf, YAW_SIGMA_RAD, PATCH_SCALE_SIGMA, tilt_sigma_rad, tilt_sigma_rad])
+    information = INDEPENDENT_PATCH_SHARE / PATCH_SPREAD**2
     for radius in SEARCH_RADII:
         offsets, value = _best_offsets(z, llr, jacobian @ motion, cell, radius)
         weighted = jacobian * (information * np.maximum(value, 0.0) / MAX_LLR)[:, None, None]
@@ -63,7 +64,7 @@ def estimate_consensus(surfaces: np.ndarray, ground: np.ndarray, cell: float, ti
         motion = np.linalg.solve(hessian, np.einsum("nki,nk->i", weighted, offsets))
     offsets, value = _best_offsets(z, llr, jacobian @ motion, cell, PATCH_SPREAD)
     prior = 0.5 * float(((motion / sigma) ** 2).sum())
-    return PatchConsensus(INDEPENDENT_SHARE * float(value.sum()) - prior, motion, offsets, value)
+    return PatchConsensus(INDEPENDENT_PATCH_SHARE * float(value.sum()) - prior, motion, offsets, value)
 
 
 def _log_likelihood_ratio(z: np.ndarray) -> np.ndarray:
@@ -102,9 +103,9 @@ def _grid_search(llr: np.ndarray, jacobian: np.ndarray, cell: float) -> np.ndarr
         total = np.zeros((side, side), np.float32)
         for surface, (east, north) in zip(padded, shift, strict=True):
             total += surface[pad - north : pad - north + side, pad + east : pad + east + side]
-        prior = 0.5 * ((motion[2] / YAW_SIGMA_RAD) ** 2 + (motion[3] / SCALE_SIGMA) ** 2)
+        prior = 0.5 * ((motion[2] / YAW_SIGMA_RAD) ** 2 + (motion[3] / PATCH_SCALE_SIGMA) ** 2)
         r, c = np.unravel_index(int(np.argmax(total)), total.shape)
-        value = INDEPENDENT_SHARE * float(total[r, c]) - prior
+        value = INDEPENDENT_PATCH_SHARE * float(total[r, c]) - prior
         if value > best:
             best, best_motion = value, motion
             best_motion[:2] = (c - side // 2) * cell, (side // 2 - r) * cell

@@ -27,7 +27,7 @@ from terrafix.messages import Verdict
 
 # Cell size as a share of the height, coarse and fine. Fine cells separate right places from the null model better (by a
 # fourth in standard deviations) at twice the cost. [measured: docs/search.md]
-CELL_PER_AGL, FINE_CELL_PER_AGL = 1 / 100, 1 / 140
+PLACE_CELL_PER_AGL, FINE_PLACE_CELL_PER_AGL = 1 / 100, 1 / 140
 # share of the height: search radius of a patch, for the error of yaw, scale and tilt at the border and of the place
 # itself [tuned]
 PLACE_SEARCH_RADIUS = 0.2
@@ -108,7 +108,7 @@ class PlaceVerifier:
     def _reduced(self, image: Image, agl_m: float) -> tuple[Image, CameraCalibration]:
         """The frame reduced to about two pixels per fine cell, computed once for all places."""
         if self._reduced_frame is None or image is not self._image:
-            fine_m = self._matcher.cell_m(agl_m, FINE_CELL_PER_AGL)
+            fine_m = self._matcher.cell_m(agl_m, FINE_PLACE_CELL_PER_AGL)
             camera = self._matcher.camera.scaled(min(2.0 * (agl_m / self._matcher.camera.fx) / fine_m, 1.0))
             size = (camera.width, camera.height)
             grey = without_colour(image, self._matcher.gradients)

@@ -12,7 +12,7 @@ import math
 from terrafix.anchor.matching.frame_matcher import View
 from terrafix.anchor.verification.hypothesis_tracker import NEW_EVIDENCE, TRACK_LLR_MAX, HypothesisTracker
 from terrafix.anchor.verification.lock_monitor import MIN_GAIN, START_LOG_ODDS
-from terrafix.anchor.verification.place_verifier import FINE_CELL_PER_AGL, PlaceVerifier
+from terrafix.anchor.verification.place_verifier import FINE_PLACE_CELL_PER_AGL, PlaceVerifier
 from terrafix.core.agreement import Agreement, Cause, Range
 from terrafix.core.node import Image
 from terrafix.map.null_model import Tail
@@ -68,7 +68,7 @@ class Probation:
     def update(self, image: Image, view: View | None) -> None:
         """Measurement update. ``view``: camera at the belief's mode, by odometry and frames since the search; None: the
         belief has no dominant mode, as on wrong ground."""
-        found = None if view is None else self._verifier.verify(image, view, FINE_CELL_PER_AGL)
+        found = None if view is None else self._verifier.verify(image, view, FINE_PLACE_CELL_PER_AGL)
         sigmas = None if found is None else self._null.sigmas(found.consensus, fine=True)
         gain = MIN_GAIN if sigmas is None else log_e_value(self._frame_tail.log_probability(sigmas))
         nats = min(self._path_m / self._stretch_m, 1.0) * min(max(gain, MIN_GAIN), TRACK_LLR_MAX)

@@ -20,7 +20,7 @@ from terrafix.anchor.verification.hypothesis_tracker import (
     TRACK_LLR_SLOPE,
 )
 from terrafix.anchor.verification.patch_null import PatchNull
-from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, PlaceVerifier
+from terrafix.anchor.verification.place_verifier import PLACE_CELL_PER_AGL, PlaceVerifier
 from terrafix.core.node import Image
 from terrafix.map.null_model import NullRow
 from terrafix.map.package import LocalMap
@@ -45,7 +45,8 @@ def localize_single_frame(
     verifier, patch_null = PlaceVerifier(source, matcher), PatchNull(null.patches)
     views = [view_at(view, correlation.best_at(m.e_m, m.n_m)[0], m.e_m, m.n_m) for m in modes]
     verified = [
-        (verifier.verify(image, place_view, CELL_PER_AGL), mode) for place_view, mode in zip(views, modes, strict=True)
+        (verifier.verify(image, place_view, PLACE_CELL_PER_AGL), mode)
+        for place_view, mode in zip(views, modes, strict=True)
     ]
     places = sorted(((c, m) for c, m in verified if c is not None), key=lambda place: -place[0].consensus.llr)
     if not places or places[0][0].fix.pnp.fit is None:

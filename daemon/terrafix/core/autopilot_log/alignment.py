@@ -18,25 +18,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.core.autopilot_log.attitude import AttitudeSeries
-from terrafix.core.autopilot_log.correlation import LagPeak, clipped, correlate
+from terrafix.core.autopilot_log.correlation import ROBUST, LagPeak, clipped, correlate
 from terrafix.core.errors import EvaluationError
 
 MIN_CELL_S = 0.1  # of the grid: short enough for the manoeuvres of a copter [tuned]
-MAX_GAP_S = 1.0  # or three typical intervals: across longer ones nothing is interpolated [tuned]
+MAX_INTERPOLATED_GAP_S = 1.0  # or three typical intervals: across longer ones nothing is interpolated [tuned]
 MIN_ATTITUDE_S = 10.0  # of attitude in record and log [tuned]
-MIN_RATE_RADPS = math.radians(0.5)  # RMS of the body rates; below, noise of the attitude outweighs motion [tuned]
+MIN_ALIGNED_RATE_RADPS = math.radians(0.5)  # RMS of the body rates; below, noise outweighs motion [tuned]
 MIN_MATCHED = 0.8  # correlation of the rates after alignment: 0.64 of their variance is explained [tuned]
 MAX_SCATTER_S = 0.025  # of the offsets of windows about their line, 1-sigma, robust [tuned]
 WINDOW_S = (5.0, 20.0)  # least and greatest duration of a window [tuned]
 MIN_WINDOWS = 5  # in a short record [tuned]
-UNIFORM = 0.5  # correlation at a lag that is not distinct: the motion repeats itself, rather than being another [tuned]
+# correlation at a lag that is not distinct: the motion repeats itself, rather than being another [tuned]
+UNIFORM_SHARE = 0.5
 MIN_WINDOW_SAMPLES = 12  # [tuned]
 MAX_WINDOW_SIGMA_S = 0.1  # a window that moves too little for this is left out [tuned]
-ITERATIONS = 6  # of Gauss-Newton, each from the line before [tuned]
-MAX_STEP_S = 0.5  # of the offset of a window in one iteration [tuned]
+ALIGNMENT_ITERATIONS = 6  # of Gauss-Newton, each from the line before [tuned]
+MAX_OFFSET_STEP_S = 0.5  # of the offset of a window in one iteration [tuned]
 DRIFT_PRIOR = 100e-6  # s/s, 1-sigma: two crystals of 50 ppm; matters for short flights only
 HUBER = 1.345  # sigmas; 95 % efficiency for Gaussian errors [spec: Huber 1964]
-ROBUST = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,10 @@ def align(record: AttitudeSeries, log: AttitudeSeries) -> Alignment:
     rates = [body_rates(attitude, cell_s) for attitude in (record, log)]
     for name, (_, values, known) in zip(("record", "log"), rates, strict=True):
         rms = rms_of(values[known])
-        if rms < MIN_RATE_RADPS:
+        if rms < MIN_ALIGNED_RATE_RADPS:
             raise EvaluationError(
                 f"too little motion to align the clocks: the {name} has body rates of {math.degrees(rms):.2f} deg/s "
-                f"(RMS), and {math.degrees(MIN_RATE_RADPS):.1f} are needed; was it a flight?"
+                f"(RMS), and {math.degrees(MIN_ALIGNED_RATE_RADPS):.1f} are needed; was it a flight?"
             )
     peak = correlate(rates[0], rates[1], cell_s)
     if not peak.distinct:
@@ -105,7 +105,7 @@ def align(record: AttitudeSeries, log: AttitudeSeries) -> Alignment:
             f"body rates correlate by {peak.correlation:.2f} at the best lag and {peak.second:.2f} at the next, "
             f"{peak.needed:.2f} is needed"
         )
-        if peak.correlation >= UNIFORM:
+        if peak.correlation >= UNIFORM_SHARE:
             raise EvaluationError(f"the motion is too short or too uniform to align the clocks: {evidence}")
         raise EvaluationError(f"the log is of another flight than the record: {evidence}; give the log of this flight")
     line = _fitted(record, log, peak)
@@ -148,7 +148,7 @@ def _accepted(record: AttitudeSeries, log: AttitudeSeries, cell_s: float, peak: 
 
 def _fitted(record: AttitudeSeries, log: AttitudeSeries, peak: LagPeak) -> _Line:
     line = _Line(peak.offset_s, peak.drift, 0.5 * float(record.t_s[0] + record.t_s[-1]))
-    for _ in range(ITERATIONS):
+    for _ in range(ALIGNMENT_ITERATIONS):
         times, offsets, sigmas = _offsets_of_windows(*_differences(record, log, line))
         if not len(times):
             return line
@@ -210,7 +210,7 @@ def _offsets_of_windows(
         motion = np.sum(w**2, axis=1)
         if sigma_s < MAX_WINDOW_SIGMA_S:
             time_s = float(np.sum(motion * times[first:last]) / energy)
-            found.append((time_s, float(np.clip(offset_s, -MAX_STEP_S, MAX_STEP_S)), sigma_s))
+            found.append((time_s, float(np.clip(offset_s, -MAX_OFFSET_STEP_S, MAX_OFFSET_STEP_S)), sigma_s))
     columns = np.array(found).reshape(-1, 3)
     return columns[:, 0], columns[:, 1], columns[:, 2]
 
@@ -267,7 +267,7 @@ def interpolate(attitude: AttitudeSeries, at_s: np.ndarray) -> tuple[np.ndarray,
         np.interp(at_s, t_s, np.unwrap(angle)) for angle in (attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
     ]
     after = np.clip(np.searchsorted(t_s, at_s), 1, t_s.size - 1)
-    gap_s = max(MAX_GAP_S, 3.0 * interval_s(attitude))
+    gap_s = max(MAX_INTERPOLATED_GAP_S, 3.0 * interval_s(attitude))
     known = (at_s >= t_s[0]) & (at_s <= t_s[-1]) & (t_s[after] - t_s[after - 1] <= gap_s)
     return np.stack(angles, axis=1), known
 

@@ -19,7 +19,7 @@ class AttitudeSeries:
 
 
 MAX_LOG_S = 86_400.0  # times further from the others are damaged [tuned]
-MAX_STEP_S = 10.0  # of one sample against its neighbours: beyond it its time is damaged [tuned]
+MAX_SAMPLE_STEP_S = 10.0  # of one sample against its neighbours: beyond it its time is damaged [tuned]
 
 
 def cleaned(attitude: AttitudeSeries) -> AttitudeSeries:
@@ -31,7 +31,7 @@ def cleaned(attitude: AttitudeSeries) -> AttitudeSeries:
     if not t_s.size:
         return AttitudeSeries(*(column[finite] for column in columns))
     near = np.median(sliding_window_view(np.pad(t_s, 2, mode="edge"), 5), axis=1)
-    keep = (np.abs(t_s - near) < MAX_STEP_S) & (np.abs(t_s - np.median(t_s)) < MAX_LOG_S)
+    keep = (np.abs(t_s - near) < MAX_SAMPLE_STEP_S) & (np.abs(t_s - np.median(t_s)) < MAX_LOG_S)
     before = np.maximum.accumulate(np.where(keep, t_s, -np.inf))
     keep[1:] &= t_s[1:] > before[:-1]
     return AttitudeSeries(*(column[finite][keep] for column in columns))

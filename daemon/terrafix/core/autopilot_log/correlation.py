@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.core.clock import MAX_CLOCK_DRIFT
+
 MIN_OVERLAP_S = 30.0  # at a lag, or half of the shorter series [tuned]
-MAX_DRIFT = 200e-6  # s/s, as in link/mavlink/timesync.py: crystals are within 50 ppm
-CLIP_SIGMAS = (
-    5.0  # rates beyond this many robust sigmas count as that: one flip must not be all of the correlation [tuned]
-)
+# rates beyond this many robust sigmas count as that: one flip must not be all of the correlation [tuned]
+CLIP_SIGMAS = 5.0
 PEAK_WIDTH_S = 3.0  # the second best lag is further than this from the best [tuned]
 ORDER = 4  # cells of the past from which a rate is predicted [tuned]
 NOISE_SHARE = 0.01  # of the variance of the rates: noise of the attitude and of its times [tuned]
@@ -70,8 +70,8 @@ def correlate(first: Rates, second: Rates, cell_s: float) -> LagPeak:
     energy = by_lag(x**2, known[1][:, None]) * by_lag(known[0][:, None], y**2)
     both = by_lag(x**2, y**2)
     usable = overlap >= min(MIN_OVERLAP_S / cell_s, 0.5 * known[0].sum(), 0.5 * known[1].sum()) - 0.5
-    ends = MAX_DRIFT * 0.5 * len(x)  # cells by which the largest drift moves the ends
-    drifts = np.linspace(-MAX_DRIFT, MAX_DRIFT, 2 * math.ceil(ends) + 1) if ends > 0.5 else np.zeros(1)
+    ends = MAX_CLOCK_DRIFT * 0.5 * len(x)  # cells by which the largest drift moves the ends
+    drifts = np.linspace(-MAX_CLOCK_DRIFT, MAX_CLOCK_DRIFT, 2 * math.ceil(ends) + 1) if ends > 0.5 else np.zeros(1)
     tried = []
     for drift in drifts:
         product = by_lag(_stretched(x, float(drift)), y)

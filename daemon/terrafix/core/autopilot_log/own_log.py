@@ -4,7 +4,7 @@ inertial readings and gimbal. Its GNSS positions are not read.
 Times are those of the autopilot's clock, less the time of the flight's zero on it."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,29 +17,35 @@ from terrafix.core.autopilot_log.attitude import AttitudeSeries, cleaned
 from terrafix.core.autopilot_log.dataflash import Table, is_dataflash, read_dataflash
 from terrafix.core.autopilot_log.ulog import ULOG_MAGIC, Topic, columns, numbers, read_topics, sampled_s
 from terrafix.core.errors import EvaluationError, SourceError
+from terrafix.core.exposures import Matched, match_exposures
 from terrafix.core.mavlink.gimbal import AT_A_LIMIT, quat_from_euler, yaw_is_from_north
 from terrafix.core.mavlink.vehicles import HeardVehicle
 from terrafix.messages import GimbalAttitude, Imu, ImuSample, VehicleState
 
 ALIGNABLE_S = 10.0  # of attitude in frames.csv, from which it is aligned with the log [spec: MIN_ATTITUDE_S]
+ANY_TIME_S = 86_400.0  # 1-sigma of the flight's zero on a log of which nothing is known [spec: a day]
 MAX_IMU_HZ = 50.0  # faster readings are averaged: what a companion requests [spec: RATES_HZ of simulated logs]
 IMU_BATCH = 5  # readings in one message: 0.1 s [spec: IMU_BATCH_NS of tlog.py]
 ARMED, DISARMED = 10, 11  # EV.Id [spec: AP_Logger.h LogEvent]
 PX4_ARMED = 2  # vehicle_status.arming_state [spec: PX4 msg/VehicleStatus.msg]
-_FLASH = ("ATT", "POS", "BARO", "ARSP", "IMU", "EV", "MNT")
+CAM, TRIG = "CAM", "TRIG"  # rows of ArduPilot: by the camera's signal where it has one; by the one that triggers it
+_FLASH = ("ATT", "POS", "BARO", "ARSP", "IMU", "EV", "MNT", CAM, TRIG)
 _TOPICS = (
     "vehicle_attitude",
     "vehicle_local_position",
     "vehicle_status",
     "sensor_combined",
     "gimbal_device_attitude_status",
+    "camera_capture",
+    "camera_trigger",
 )
 
 
 @dataclass(frozen=True)
 class _Read:
     """All on the log's clock. ``heights``: times and metres above take-off; ``forces``: times, and specific force and
-    angular velocity (N, 6), forward, right, down; ``gimbal``: times, attitudes."""
+    angular velocity (N, 6), forward, right, down; ``gimbal``: times, attitudes; ``exposures``: times (N,) of each kind,
+    the preferred one first."""
 
     attitude: AttitudeSeries
     heights: tuple[np.ndarray, np.ndarray]
@@ -48,17 +54,25 @@ class _Read:
     gimbal: list[tuple[float, GimbalAttitude]]
     airspeeds: tuple[np.ndarray, np.ndarray] = field(default_factory=lambda: (np.zeros(0), np.zeros(0)))
     skipped_bytes: int = 0
+    exposures: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 class OwnLog:
     """The same as ``TelemetryLog`` of a ground station's log. ``zero_s``: of the flight on the log's clock; None: by
-    the attitude of ``states``, those of the frames, else the first attitude of the log.
+    the attitude of ``states``, those of the frames, else by the exposures of the frames, whose stamps are ``frames_s``,
+    else the first attitude of the log.
 
     Raises SourceError: it cannot be read, has no attitude, or is of another flight than ``states``."""
 
     vehicles: Sequence[HeardVehicle] = ()
 
-    def __init__(self, path: Path, zero_s: float | None = None, states: Sequence[VehicleState] = ()) -> None:
+    def __init__(
+        self,
+        path: Path,
+        zero_s: float | None = None,
+        states: Sequence[VehicleState] = (),
+        frames_s: Sequence[float] = (),
+    ) -> None:
         self.path, read = path, _read(path)
         if not read.attitude.t_s.size:
             raise SourceError(f"{path}: holds no attitude of an autopilot; set the logging to record it, or remove it")
@@ -66,17 +80,21 @@ class OwnLog:
         self.zero = "[telemetry] log_zero_s"
         self._rate = 1.0  # of the log's clock
         if zero_s is None:
-            zero_s = self._aligned(read.attitude, states)
+            zero_s = self._aligned(read, states, np.array(frames_s))
         self._zero_s = zero_s
         self.states, self.imu = self._states(read), self._imu(read)
+        self.exposures = {
+            kind: [self._ns(float(t)) for t in np.unique(times)] for kind, times in read.exposures.items() if len(times)
+        }
         self.gimbal = [msgspec.structs.replace(one, t_ns=self._ns(t_s)) for t_s, one in read.gimbal]
 
     def notes(self) -> list[str]:
         """Nothing of it was repaired."""
         return []
 
-    def _aligned(self, attitude: AttitudeSeries, states: Sequence[VehicleState]) -> float:
+    def _aligned(self, read: _Read, states: Sequence[VehicleState], frames_s: np.ndarray) -> float:
         """-> time of the flight's zero on the log's clock, and sets its rate."""
+        attitude = read.attitude
         frames = np.array(
             [
                 (state.t_ns * 1e-9, state.roll_rad, state.pitch_rad, state.yaw_rad)
@@ -85,9 +103,14 @@ class OwnLog:
             ]
         ).reshape(-1, 4)
         if len(frames) < 2 or frames[-1, 0] - frames[0, 0] < ALIGNABLE_S:
-            self.zero = (
-                "its first attitude: frames.csv has no attitude to align it by; [telemetry] log_zero_s states it"
-            )
+            refused = "frames.csv has no attitude"
+            for kind, times_s in read.exposures.items():
+                matched = match_exposures(frames_s, np.unique(times_s), ANY_TIME_S, complete=True)
+                if isinstance(matched, Matched):
+                    self.zero = f"by the rows {kind}, of {int(matched.seen.sum())} of {len(frames_s)} frames"
+                    return -matched.latency_s
+                refused += f"; {kind}: {matched}" if len(times_s) else ""
+            self.zero = f"its first attitude: {refused}; [telemetry] log_zero_s states it"
             return float(attitude.t_s[0])
         try:
             found = align(cleaned(AttitudeSeries(*frames.T)), attitude)
@@ -117,26 +140,30 @@ class OwnLog:
         return sorted(found, key=lambda one: one.t_ns)
 
     def _imu(self, read: _Read) -> list[Imu]:
-        t_s, values = read.forces
-        keep = np.isfinite(values).all(axis=1) & np.isfinite(t_s)
-        keep[1:] &= np.diff(t_s) > 0
-        t_s, values = t_s[keep], values[keep]
-        if len(t_s) < 2:
-            return []
-        mean_of = max(1, round(1.0 / (MAX_IMU_HZ * float(np.median(np.diff(t_s))))))
-        groups = len(t_s) // mean_of
-        times = t_s[: groups * mean_of].reshape(groups, mean_of).mean(axis=1)
-        means = values[: groups * mean_of].reshape(groups, mean_of, 6).mean(axis=1)
-        return list(self._batches(times, means))
+        return imu_batches(*read.forces, self._ns, "log")
 
-    def _batches(self, times: np.ndarray, means: np.ndarray) -> Iterator[Imu]:
-        for first in range(0, len(times), IMU_BATCH):
-            ns = [self._ns(float(t)) for t in times[first : first + IMU_BATCH]]
-            samples: list[ImuSample] = [
-                (ns[-1] - t_ns, *map(float, row))  # type: ignore[misc]
-                for t_ns, row in zip(ns, means[first : first + IMU_BATCH], strict=True)
-            ]
-            yield Imu(t_ns=ns[-1], source="log", samples=samples)
+
+def imu_batches(t_s: np.ndarray, values: np.ndarray, ns_of: Callable[[float], int], source: str) -> list[Imu]:
+    """``values`` (N, 6): specific force and angular velocity, forward, right, down, at ``t_s``; means of faster ones
+    than MAX_IMU_HZ. ``ns_of``: time of the flight of a ``t_s``."""
+    keep = np.isfinite(values).all(axis=1) & np.isfinite(t_s)
+    keep[1:] &= np.diff(t_s) > 0
+    t_s, values = t_s[keep], values[keep]
+    if len(t_s) < 2:
+        return []
+    mean_of = max(1, round(1.0 / (MAX_IMU_HZ * float(np.median(np.diff(t_s))))))
+    groups = len(t_s) // mean_of
+    times = t_s[: groups * mean_of].reshape(groups, mean_of).mean(axis=1)
+    means = values[: groups * mean_of].reshape(groups, mean_of, 6).mean(axis=1)
+    found = []
+    for first in range(0, groups, IMU_BATCH):
+        ns = [ns_of(float(t)) for t in times[first : first + IMU_BATCH]]
+        samples: list[ImuSample] = [
+            (ns[-1] - t_ns, *map(float, row))  # type: ignore[misc]
+            for t_ns, row in zip(ns, means[first : first + IMU_BATCH], strict=True)
+        ]
+        found.append(Imu(t_ns=ns[-1], source=source, samples=samples))
+    return found
 
 
 def _read(path: Path) -> _Read:
@@ -172,6 +199,7 @@ def _of_ardupilot(path: Path) -> _Read:
         gimbal=list(_mount(tables["MNT"])),
         airspeeds=(speeds.t_s[healthy], speeds.column("Airspeed")[healthy]),
         skipped_bytes=flash.skipped_bytes,
+        exposures={kind: tables[kind].t_s for kind in (CAM, TRIG)},
     )
 
 
@@ -203,6 +231,7 @@ def _of_px4(topics: dict[str, dict[int, Topic]]) -> _Read:
         heights=(up_s, up_m - zero_m),
         forces=(sampled_s(sensors), columns(sensors, *accel, *gyro)),
         armed=armed,
+        exposures={name: sampled_s(first(name)) for name in _TOPICS[5:]},
         gimbal=[one for number, topic in topics.get(_TOPICS[4], {}).items() for one in _device(number, topic)],
     )
 

@@ -3,10 +3,10 @@
 from collections import Counter
 from typing import Any
 
-GRAVITY_MPS2 = 9.80665  # standard gravity, the unit g of MAVLink's scaled messages
+STANDARD_GRAVITY_MPS2 = 9.80665  # standard gravity, the unit g of MAVLink's scaled messages
 # The first IMU before the others; only HIGHRES_IMU carries floats. Only ArduPilot sends RAW_IMU in these units.
 IMU_MESSAGES = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU", "SCALED_IMU2")
-MAX_FORCE_MPS2 = 32.0 * GRAVITY_MPS2  # saturation of the 16-bit fields: milli-g ...
+MAX_FORCE_MPS2 = 32.0 * STANDARD_GRAVITY_MPS2  # saturation of the 16-bit fields: milli-g ...
 MAX_RATE_RADPS = 32.0  # ... and milliradians per second
 MAX_BOOT_US = 10**14  # three years; a greater value is a UNIX time
 
@@ -15,7 +15,7 @@ Readings = tuple[float, float, float, float, float, float]
 
 def imu_readings(message: Any) -> Readings | None:
     """Specific force forward, right, down [m/s^2] and angular velocity [rad/s]; None: NaN or saturated."""
-    scale = (1.0, 1.0) if message.get_type() == "HIGHRES_IMU" else (GRAVITY_MPS2 * 1e-3, 1e-3)
+    scale = (1.0, 1.0) if message.get_type() == "HIGHRES_IMU" else (STANDARD_GRAVITY_MPS2 * 1e-3, 1e-3)
     force = tuple(scale[0] * v for v in (message.xacc, message.yacc, message.zacc))
     rate = tuple(scale[1] * v for v in (message.xgyro, message.ygyro, message.zgyro))
     # In this form the test also rejects NaN.

@@ -10,23 +10,23 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink  # common has no CAMERA_FEEDBACK
 
 from terrafix.core.errors import SourceError
-from terrafix.core.mavlink import gimbal
+from terrafix.core.exposures import EXPOSURE_KINDS
+from terrafix.core.mavlink import exposure, gimbal
 from terrafix.core.mavlink.airspeed import AirspeedReader
 from terrafix.core.mavlink.gimbal import GimbalReader
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
 from terrafix.core.mavlink.imu import MAX_BOOT_US, ImuStreamSelector, boot_ns, imu_readings
 from terrafix.core.mavlink.log_clock import Jump, repaired
 from terrafix.core.mavlink.log_records import address, payload, read_records, record, sequence
-from terrafix.core.mavlink.vehicles import ARMED_FLAG, HeardVehicle, choose_vehicle, firmware_of
+from terrafix.core.mavlink.vehicles import ARMED_FLAG, AUTOPILOT_COMPONENT, HeardVehicle, choose_vehicle, firmware_of
 from terrafix.messages import GimbalAttitude, Imu, ImuSample, VehicleState
 
 __all__ = ["TelemetryLog", "is_tlog", "read_imu", "read_tlog", "record"]
 
-AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1; a tlog also holds messages of the ground station and the gimbal
-IMU_BATCH_NS = 100_000_000  # duration of the samples in one Imu message
+LOG_IMU_BATCH_NS = 100_000_000  # duration of the samples in one Imu message
 CRC_EXTRA = {number: int(kind.crc_extra) for number, kind in mavlink.mavlink_map.items()}
 _STATES = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT,
@@ -62,7 +62,7 @@ _BOOT_TIMES: dict[int, tuple[int, int, int]] = {
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: (0, 8, 1),
 }
 # In order of preference. VFR_HUD.alt is above sea level, so it is used relative to the first record, taken as ground.
-_HEIGHTS = ("GLOBAL_POSITION_INT", "ALTITUDE", "VFR_HUD")
+_HEIGHT_MESSAGES = ("GLOBAL_POSITION_INT", "ALTITUDE", "VFR_HUD")
 
 _TimedReadings = tuple[int, int, tuple[float, ...]]  # arrival time [ns], boot time [ns], readings (imu_readings)
 
@@ -133,6 +133,22 @@ class TelemetryLog:
         reader = GimbalReader()
         timed = ((message, (t_us - self.t0_us) * 1000) for t_us, message in self.messages(gimbal.MESSAGE_IDS))
         return [attitude for one in timed if (attitude := reader.take(*one)) is not None]
+
+    @cached_property
+    def exposures(self) -> dict[str, list[int]]:
+        """Times of the exposures of each kind, the preferred one first, in order. With the time of the autopilot's
+        clock they are as far apart as on it, and arrive as the fastest of them."""
+        found: dict[str, list[tuple[int, int | None]]] = {kind: [] for kind in EXPOSURE_KINDS}
+        for t_us, message in self.messages(exposure.EXPOSURE_MESSAGE_IDS):
+            if (read := exposure.exposure_of(message)) is not None:
+                found[read[0]].append(((t_us - self.t0_us) * 1000, read[2]))
+        times: dict[str, list[int]] = {}
+        for kind, of_kind in found.items():
+            late_ns = min((arrived - boot for arrived, boot in of_kind if boot is not None), default=0)
+            at_ns = {arrived if boot is None else boot + late_ns for arrived, boot in of_kind}
+            if at_ns:
+                times[kind] = sorted(at_ns)
+        return times
 
     def notes(self) -> list[str]:
         """Which vehicle was chosen and what was repaired, in words."""
@@ -254,14 +270,14 @@ def _note(vehicle: HeardVehicle, message: Any) -> None:
 
 
 def _states(t0_us: int, messages: Iterator[tuple[int, Any]]) -> list[VehicleState]:
-    heights: dict[str, list[VehicleState]] = {kind: [] for kind in _HEIGHTS}
+    heights: dict[str, list[VehicleState]] = {kind: [] for kind in _HEIGHT_MESSAGES}
     attitudes: list[VehicleState] = []
     headings: list[VehicleState] = []
     airspeeds: list[VehicleState] = []
     airspeed_of = AirspeedReader()
     hud_ground_m: float | None = None
     armed: bool | None = None
-    takeoff_heights = {kind: TakeOffHeight() for kind in _HEIGHTS}
+    takeoff_heights = {kind: TakeOffHeight() for kind in _HEIGHT_MESSAGES}
     for t_us, message in messages:
         t_ns = (t_us - t0_us) * 1000
         kind = message.get_type()
@@ -291,7 +307,7 @@ def _states(t0_us: int, messages: Iterator[tuple[int, Any]]) -> list[VehicleStat
             heights[kind].append(VehicleState(t_ns=t_ns, source="mavlink", agl_m=message.alt - hud_ground_m))
             yaw_rad = math.remainder(math.radians(message.heading), math.tau)
             headings.append(VehicleState(t_ns=t_ns, source="mavlink", yaw_rad=yaw_rad))
-    height = next((heights[kind] for kind in _HEIGHTS if heights[kind]), [])
+    height = next((heights[kind] for kind in _HEIGHT_MESSAGES if heights[kind]), [])
     return sorted([*(attitudes or headings), *height, *airspeeds], key=lambda state: state.t_ns)
 
 
@@ -320,7 +336,7 @@ def _batches(boot: list[_TimedReadings]) -> Iterator[Imu]:
     for i, (_, measured_ns, readings) in enumerate(boot):
         t_ns = measured_ns + offset_ns
         batch.append((t_ns, readings))
-        if t_ns - batch[0][0] >= IMU_BATCH_NS or i == len(boot) - 1:
+        if t_ns - batch[0][0] >= LOG_IMU_BATCH_NS or i == len(boot) - 1:
             samples: list[ImuSample] = [(t_ns - at_ns, *values) for at_ns, values in batch]  # type: ignore[misc]
             yield Imu(t_ns=t_ns, source="mavlink", samples=samples)
             batch = []

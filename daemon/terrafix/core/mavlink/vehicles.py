@@ -15,11 +15,13 @@ ARDUPILOT_TYPES: dict[str, frozenset[int]] = {
     "AntennaTracker": frozenset({5}),
 }
 NO_VEHICLES = frozenset({5, 6, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})  # trackers, stations, components
+# MAV_COMP_ID_AUTOPILOT1; ground stations, cameras and gimbals send heartbeats as well [spec: MAVLink]
+AUTOPILOT_COMPONENT = 1
 ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT
 ARMED_FLAG = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 # A vehicle whose attitude swings by more than this, or which is faster, is not standing. Compass and level of a
 # standing one wander by a degree or two; GNSS velocity has a noise of some 0.1 m/s.
-MIN_SWING_RAD, MIN_SPEED_MPS = math.radians(6.0), 2.0
+MIN_SWING_RAD, MIN_MOVING_MPS = math.radians(6.0), 2.0
 SWING_SHARE = 0.02  # of the attitudes at each end that do not count, of a vehicle that is being handled
 
 
@@ -48,7 +50,7 @@ class HeardVehicle:
     @property
     def moves(self) -> bool:
         """Whether it does not just stand."""
-        return self.speed_mps > MIN_SPEED_MPS or _swing_rad(self.angles_rad) > MIN_SWING_RAD
+        return self.speed_mps > MIN_MOVING_MPS or _swing_rad(self.angles_rad) > MIN_SWING_RAD
 
     def name(self) -> str:
         """ "1 (ArduCopter)"; of a vehicle without a known firmware its type."""

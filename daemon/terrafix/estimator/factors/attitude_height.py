@@ -55,10 +55,7 @@ def attitude_height_residual(
     heading = local_rotation_up(float(bias[HEADING]))  # a positive bias reads too far clockwise: turn it back
     expected = heading @ r_w_b @ r_b_c @ mount_tilt_rotation(float(bias[MOUNT_TILT_X]), float(bias[MOUNT_TILT_Y]))
     rotation_w = log_so3(r_w_c @ expected.T)
-    scale, seen_m = (
-        math.exp(float(bias[LOG_HEIGHT_SCALE])),
-        float(pose.translation()[UP] + bias[HEIGHT]) - ground_m,
-    )
+    scale, seen_m = (math.exp(float(bias[LOG_HEIGHT_SCALE])), float(pose.translation()[UP] + bias[HEIGHT]) - ground_m)
     height = scale * seen_m - (up_m - ground_m)
     by_pose = np.zeros((4, POSE_SIZE))
     by_pose[ROTATION_ROWS, ROTATION] = r_w_c
@@ -71,13 +68,7 @@ def attitude_height_residual(
 
 
 def attitude_height_factor(
-    pose_key: int,
-    bias_key: int,
-    sigmas: np.ndarray,
-    r_w_b: np.ndarray,
-    r_b_c: np.ndarray,
-    up_m: float,
-    ground_m: float,
+    pose_key: int, bias_key: int, sigmas: np.ndarray, r_w_b: np.ndarray, r_b_c: np.ndarray, up_m: float, ground_m: float
 ) -> gtsam.CustomFactor:
     """``sigmas`` (4,): rotation about east, north, up [rad], height [m]; large for components that are not reported."""
 

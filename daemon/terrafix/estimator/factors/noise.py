@@ -5,13 +5,13 @@ import numpy as np
 
 # Huber threshold, in sigmas, of poses and motion increments: a measurement that passed its gate but lies in the tail
 # gets less weight. [tuned]
-HUBER_K = 2.0
+FACTOR_HUBER_K = 2.0
 MIN_HEIGHT_M = 1.0  # lower bound of a height by which a factor scales [tuned]
 
 
 def robust_noise(cov: np.ndarray) -> gtsam.noiseModel.Robust:
     """Gaussian noise of covariance ``cov`` under a Huber loss."""
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(FACTOR_HUBER_K)
     return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov, False))
 
 

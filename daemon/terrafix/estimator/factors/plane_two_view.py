@@ -12,7 +12,7 @@ import numpy as np
 from terrafix.core.pose import project_with_jacobian
 from terrafix.estimator.factors.linearization_cache import custom_factor
 from terrafix.estimator.factors.noise import MIN_HEIGHT_M, whiten_common
-from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS, Ground
+from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS, Ground, MatchedRays
 from terrafix.estimator.state import (
     CALIBRATION_SIZE,
     EAST,
@@ -31,9 +31,8 @@ BLOCK_HUBER_K = 1.5  # Huber threshold, in expected norms of the whitened residu
 # of its estimate. The modelled part is equal in all frames and looks like a tilt that grows with the distance flown,
 # so it is a state; the rest is noise. [tuned]
 K1_MODEL_SIGMA, K1_MODEL_SHARE = 0.0015, 0.05
-REDUCED_SIZE = (
-    11  # 6 of the step, 3 of the keyframe's tilt, 1 of the lens, 1 unexplained norm [spec: columns of the QR]
-)
+# 6 of the step, 3 of the keyframe's tilt, 1 of the lens, 1 unexplained norm [spec: columns of the QR]
+REDUCED_SIZE = 11
 STEP_AND_CONSTANT = [0, 1, 2, 3, 4, 5, 10]  # columns of the QR [spec: order of the stacked Jacobian]
 TILT_COLUMNS, K1_COLUMN = slice(6, 9), 9  # [spec: order of the stacked Jacobian]
 STEP_COLUMNS, CONSTANT_COLUMN = slice(0, 6), 6  # of the reduced step and constant [spec: STEP_AND_CONSTANT]
@@ -108,15 +107,11 @@ def plane_two_view_factor(
     bias_key: int,
     keyframe: gtsam.Pose3,
     pose: gtsam.Pose3,
-    pairs: np.ndarray,
-    sigma: float,
-    ground: Ground,
+    rays: MatchedRays,
     keyframe_bias_key: int | None = None,
-    k1: float = 0.0,
     lens: LensNoise | None = None,
 ) -> gtsam.CustomFactor:
-    """``keyframe``, ``pose``: first estimates. ``pairs`` (N, 4): normalised, undistorted by radial coefficient ``k1``,
-    with 1-sigma ``sigma`` of a coordinate. The uncertainty of height and slope of the plane is part of the noise.
+    """``keyframe``, ``pose``: first estimates. The uncertainty of height and slope of the plane is part of the noise.
 
     Two cameras above a plane have nine parameters: the pose of one in the other, with the translation in units of the
     keyframe's height, and the keyframe's tilt against the plane. The radial coefficient is a tenth. In these the
@@ -126,12 +121,13 @@ def plane_two_view_factor(
     and would pull the estimate down.
 
     ``keyframe_bias_key``: B of the keyframe. It enters only where the elevation between both is unknown
-    (``ground.rise_sigma_m``; see ``motion_factor``). ``lens``: where other factors determine the lens. Relief looks
+    (``rise_sigma_m``; see ``motion_factor``). ``lens``: where other factors determine the lens. Relief looks
     like a lens error for as long as it is in view, and is not on the plane; None: as in flight, where the height is a
     height as seen through the described lens, and the pairs determine the radial coefficient."""
+    ground, k1 = rays.ground, rays.k1
     if not ground.rise_sigma_m:
         keyframe_bias_key = None
-    model = _linear_model(keyframe, pose, pairs, sigma, ground, k1, lens or LensNoise(0.0, 0.0))
+    model = _linear_model(keyframe, pose, rays, lens or LensNoise(0.0, 0.0))
     first_up_m = keyframe.translation()[UP]
 
     def error(_this: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
@@ -223,20 +219,13 @@ def k1_model_sigma(k1: float) -> float:
     return float(np.hypot(K1_MODEL_SIGMA, K1_MODEL_SHARE * k1))
 
 
-def _linear_model(
-    keyframe: gtsam.Pose3,
-    pose: gtsam.Pose3,
-    pairs: np.ndarray,
-    sigma: float,
-    ground: Ground,
-    k1: float,
-    lens: LensNoise,
-) -> _LinearModel:
+def _linear_model(keyframe: gtsam.Pose3, pose: gtsam.Pose3, rays: MatchedRays, lens: LensNoise) -> _LinearModel:
+    ground = rays.ground
     normal = np.array([-ground.slope_e, -ground.slope_n, 1.0])
     p = keyframe.translation()
     offset = float(p[UP]) - ground.height_m - ground.slope_e * float(p[EAST]) - ground.slope_n * float(p[NORTH])
-    k1_sigma = float(np.hypot(k1_model_sigma(k1), lens.k1))
-    reduced = _reduced(keyframe, pose, pairs, sigma, _Plane(ground, normal, offset, k1_sigma, lens.focal))
+    k1_sigma = float(np.hypot(k1_model_sigma(rays.k1), lens.k1))
+    reduced = _reduced(keyframe, pose, rays, _Plane(ground, normal, offset, k1_sigma, lens.focal))
     by_bias = np.zeros((REDUCED_SIZE, CALIBRATION_SIZE), order="F")
     by_bias[:, RADIAL_K1] = reduced.by_k1
     up_first = keyframe.rotation().matrix().T @ normal
@@ -245,9 +234,9 @@ def _linear_model(
     return _LinearModel(reduced, normal, keyframe.between(pose), up_unit, by_rotation, by_bias)
 
 
-def _reduced(keyframe: gtsam.Pose3, pose: gtsam.Pose3, pairs: np.ndarray, sigma: float, plane: _Plane) -> _Reduced:
+def _reduced(keyframe: gtsam.Pose3, pose: gtsam.Pose3, rays: MatchedRays, plane: _Plane) -> _Reduced:
     """QR of the Jacobian of all pairs, whitened by the noise of the pairs and of the plane."""
-    ground = plane.ground
+    ground, pairs, sigma = plane.ground, rays.pairs, rays.sigma
     residual, by_keyframe, by_pose, points, by_height = same_ground_residual(
         keyframe, pose, pairs, plane.normal, plane.offset
     )

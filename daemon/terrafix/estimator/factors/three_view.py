@@ -18,29 +18,21 @@ from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.linearization_cache import custom_factor
 from terrafix.estimator.factors.noise import MIN_HEIGHT_M
 from terrafix.estimator.models.plane_motion import EFFECTIVE_PAIRS
-from terrafix.estimator.state import (
-    CALIBRATION_SIZE,
-    HEIGHT,
-    POSE_SIZE,
-    RADIAL_K1,
-    ROTATION,
-    TRANSLATION,
-    UP,
-)
+from terrafix.estimator.state import CALIBRATION_SIZE, HEIGHT, POSE_SIZE, RADIAL_K1, ROTATION, TRANSLATION, UP
 
-MIN_TRIPLES = 12  # points [tuned]
+MIN_FACTOR_TRIPLES = 12  # points [tuned]
 # A focal length error is equal in all images: n errors of one sigma add up to n sigmas, not to the root of n as
 # independent ones do. Root of an n of 25: a turn or two, in which it looks like a change of heading. [tuned]
 FOCAL_REPEATS = 5.0
 MIN_TRANSLATION = 0.05  # least length of both translations, share of the height: shorter ones give no depth [tuned]
 SHARED_TRIPLES = 3.0  # constraints that share an image, with the same errors of its points [spec: three views each]
-MAX_ITERATIONS = 5  # of Gauss-Newton [tuned]
-STEP_TOLERANCE = 1e-5  # convergence, rad and heights [tuned]
-HUBER_K = 1.5  # Huber threshold of a point, in sigmas [tuned]
+MAX_POINT_ITERATIONS = 5  # of Gauss-Newton [tuned]
+POINT_STEP_TOLERANCE = 1e-5  # convergence, rad and heights [tuned]
+POINT_HUBER_K = 1.5  # Huber threshold of a point, in sigmas [tuned]
 # Median residual of points whose three free numbers have a 1-sigma of one: root of a third of the median of chi-square
 # with 3 dof. [spec: chi-square]
 MEDIAN_RESIDUAL = 0.888
-MAX_SIGMA_RATIO = 4.0  # residual sigma over stated sigma, above which the points are not the same [tuned]
+MAX_RESIDUAL_RATIO = 4.0  # residual sigma over stated sigma, above which the points are not the same [tuned]
 MAX_BEHIND = 0.1  # largest share of points behind the camera [tuned]
 # 1-sigma of the second radial coefficient, which is neither described nor estimated, where only a focal length is
 # known. Points off one plane are distorted by it. `village-1` has 0.03. [tuned]
@@ -53,7 +45,7 @@ NULL_EIGENVALUE = 1e-9  # share of the largest eigenvalue, below which a directi
 # Estimated: tangents of both outer cameras, and k1; eliminated: k2 and the relative focal length. [spec: layout]
 ESTIMATED, NUISANCE = 13, 2
 FIRST, LAST, CAMERAS, K1 = slice(0, 6), slice(6, 12), slice(0, 12), 12  # of the estimated [spec: layout]
-K2, FOCAL = 13, 14  # columns of the nuisance parameters [spec: layout]
+K2, FOCAL_COLUMN = 13, 14  # columns of the nuisance parameters [spec: layout]
 MIN_DEPTH = 0.05  # of a point in an outer camera, in units of its depth in the middle one [tuned]
 
 
@@ -127,7 +119,7 @@ def three_view_constraint_of_focal(
     if solution is None:
         return None
     _, at, normal = solution
-    kept = [*range(ESTIMATED), FOCAL]
+    kept = [*range(ESTIMATED), FOCAL_COLUMN]
     left, right = _without(normal.whole, normal.whole_right, kept, {K2: K2_SIGMA})
     jacobian, constant = _square_root(left, right)
     return ThreeViewConstraint(at, jacobian[:, :-1], constant, jacobian[:, -1])
@@ -173,7 +165,7 @@ def _solve(
 ) -> tuple[np.ndarray, ThreeViewPose, _NormalEquations] | None:
     """-> points (N, 3) as x, y and inverse depth in the middle camera; the cameras; the normal equations there."""
     lengths = [float(np.linalg.norm(pose.translation())) for pose in (guess.first, guess.last)]
-    if len(triples) < MIN_TRIPLES or min(lengths) < MIN_TRANSLATION * guess.height_m:
+    if len(triples) < MIN_FACTOR_TRIPLES or min(lengths) < MIN_TRANSLATION * guess.height_m:
         return None
     undistorted = undistort_division(triples.reshape(-1, 2), guess.k1)
     seen = undistorted.reshape(-1, 3, 2)[:, [1, 0, 2]]  # the middle camera first
@@ -181,7 +173,7 @@ def _solve(
     points, at, offset = _bundle_adjustment(seen, guess, prior_sigmas, sigma_norm, focal_sigma)
     normal = _normal_equations(points, seen, at, sigma_norm, focal_sigma)
     behind = (points[:, 2] <= 0.0).mean() > MAX_BEHIND
-    if not np.isfinite(normal.left).all() or behind or normal.sigma > MAX_SIGMA_RATIO * sigma_norm:
+    if not np.isfinite(normal.left).all() or behind or normal.sigma > MAX_RESIDUAL_RATIO * sigma_norm:
         return None
     if np.abs(offset / prior_sigmas).max() > PRIOR_GATE_SIGMAS:
         return None
@@ -196,7 +188,7 @@ def _bundle_adjustment(
     points = np.column_stack([seen[:, 0], np.full(len(seen), 1.0 / guess.height_m)])
     unit = np.tile([1.0, 1.0, 1.0, *[guess.height_m] * 3], 2)
     at, offset = guess, np.zeros(12)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(MAX_POINT_ITERATIONS):
         normal = _normal_equations(points, seen, at, sigma_norm, focal_sigma)
         information = normal.left[CAMERAS, CAMERAS] + np.diag(prior_sigmas**-2)  # the radial coefficient is fixed here
         step = -np.linalg.solve(information, normal.right[CAMERAS] + offset / prior_sigmas**2)
@@ -205,7 +197,7 @@ def _bundle_adjustment(
         )
         at = replace(at, first=at.first.retract(step[FIRST]), last=at.last.retract(step[LAST]))
         offset = np.concatenate([guess.first.logmap(at.first), guess.last.logmap(at.last)])
-        if np.abs(step / unit).max() < STEP_TOLERANCE:
+        if np.abs(step / unit).max() < POINT_STEP_TOLERANCE:
             break
     return points, at, offset
 
@@ -220,7 +212,7 @@ def _normal_equations(
     sigma = float(np.median(size)) / MEDIAN_RESIDUAL
     stated = max(sigma_norm, sigma)
     independent = min(1.0, EFFECTIVE_PAIRS / len(seen)) / SHARED_TRIPLES
-    weight = np.minimum(1.0, HUBER_K * stated / np.maximum(size, 1e-12)) * (independent / stated**2)
+    weight = np.minimum(1.0, POINT_HUBER_K * stated / np.maximum(size, 1e-12)) * (independent / stated**2)
     by_point_t = np.swapaxes(by_point * weight[:, None, None], 1, 2)
     inner = np.linalg.inv(by_point_t @ by_point + 1e-12 * np.eye(3))
     cross = np.swapaxes(by_point_t @ by_cameras, 1, 2)
@@ -230,7 +222,7 @@ def _normal_equations(
     gain = np.moveaxis(cross @ inner, 1, 0).reshape(ESTIMATED + NUISANCE, -1)
     schur = (flat * flat_weight).T @ flat - gain @ columns.T
     rhs = (flat * flat_weight).T @ residual.ravel() - gain @ gradient.ravel()
-    priors = {K2: K2_SIGMA, FOCAL: FOCAL_REPEATS * focal_sigma}
+    priors = {K2: K2_SIGMA, FOCAL_COLUMN: FOCAL_REPEATS * focal_sigma}
     left, right = _without(schur, rhs, list(range(ESTIMATED)), priors)
     return _NormalEquations(left, right, schur, rhs, inner, cross[:, :ESTIMATED], gradient, sigma)
 
@@ -260,7 +252,7 @@ def project_triples(
             by_cameras[:, rows, own : own + 3] = by_q @ _cross(q)
             by_cameras[:, rows, own + 3 : own + POSE_SIZE] = -points[:, 2, None, None] * by_q
         by_cameras[:, rows, K1], by_cameras[:, rows, K2] = r2 * xy, r2**2 * xy
-        by_cameras[:, rows, FOCAL] = xy
+        by_cameras[:, rows, FOCAL_COLUMN] = xy
         by_point[:, rows, :2] = by_q @ r.T[:, :2]
         by_point[:, rows, 2] = -by_q @ (r.T @ p)
     return residual, by_cameras, by_point

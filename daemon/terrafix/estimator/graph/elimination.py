@@ -14,11 +14,7 @@ from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, POSE_SIZE, N
 
 NODE_SIZE = POSE_SIZE + CALIBRATION_SIZE + MOTION_SIZE  # [spec: order C, B, V]
 # Variable, first component and size of each block of a node. [spec: order C, B, V]
-_BLOCKS = (
-    (C, 0, POSE_SIZE),
-    (B, POSE_SIZE, CALIBRATION_SIZE),
-    (V, POSE_SIZE + CALIBRATION_SIZE, MOTION_SIZE),
-)
+_BLOCKS = ((C, 0, POSE_SIZE), (B, POSE_SIZE, CALIBRATION_SIZE), (V, POSE_SIZE + CALIBRATION_SIZE, MOTION_SIZE))
 # Least diagonal of the root information, per metre and radian: below it a node is indeterminate. [tuned]
 MIN_ROOT = 1e-9
 

@@ -247,18 +247,7 @@ class PoseGraph:
 
     def _two_view_factor(self, keyframe: int, node: int, pose: gtsam.Pose3, rays: MatchedRays) -> gtsam.NonlinearFactor:
         """``pose``: first estimate of ``node``."""
-        return plane_two_view_factor(
-            C(keyframe),
-            C(node),
-            B(node),
-            self.state(keyframe).pose,
-            pose,
-            rays.pairs,
-            rays.sigma,
-            rays.ground,
-            B(keyframe),
-            rays.k1,
-        )
+        return plane_two_view_factor(C(keyframe), C(node), B(node), self.state(keyframe).pose, pose, rays, B(keyframe))
 
     def _motion_factor(self, node: int, new: NewNode) -> gtsam.NoiseModelFactor:
         newest, increment = self.newest, new.increment

@@ -14,8 +14,8 @@ from terrafix.estimator.graph.elimination import NODE_SIZE, eliminate, graph_of,
 from terrafix.estimator.state import CALIBRATION_SIZE, POSE_SIZE, NodeState
 
 # Blocks of the covariance of a node. [spec: order C, B, V]
-POSE, CALIBRATION = slice(0, POSE_SIZE), slice(POSE_SIZE, POSE_SIZE + CALIBRATION_SIZE)
-MOTION = slice(POSE_SIZE + CALIBRATION_SIZE, NODE_SIZE)
+POSE_BLOCK, CALIBRATION_BLOCK = slice(0, POSE_SIZE), slice(POSE_SIZE, POSE_SIZE + CALIBRATION_SIZE)
+MOTION_BLOCK = slice(POSE_SIZE + CALIBRATION_SIZE, NODE_SIZE)
 
 
 class PropagatedCovariance:

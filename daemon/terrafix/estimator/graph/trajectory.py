@@ -64,10 +64,7 @@ class Trajectory:
         self._p_m[ends[0] + 1 : ends[1]] = np.nan
 
     def solved(
-        self,
-        marginals: dict[int, GaussianMarginal],
-        poses: dict[int, gtsam.Pose3],
-        intervals: list[tuple[int, int]],
+        self, marginals: dict[int, GaussianMarginal], poses: dict[int, gtsam.Pose3], intervals: list[tuple[int, int]]
     ) -> tuple[np.ndarray, np.ndarray]:
         """``marginals`` of the unknowns, linear around ``poses``; ``intervals``: pairs of unknowns that factors tie,
         with the nodes between them. -> positions (N, 3), covariances (N, 3, 3); nan where indeterminate."""

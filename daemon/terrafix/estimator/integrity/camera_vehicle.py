@@ -12,29 +12,21 @@ from terrafix.core.camera import Mount
 from terrafix.estimator.integrity.turn_comparison import Turn, TurnComparison
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.monitors.visual_motion import image_turn
-from terrafix.messages import (
-    Camera,
-    CameraVehicle,
-    CandidateAttitude,
-    Odometry,
-    ServedVehicle,
-    VehicleState,
-    Verdict,
-)
+from terrafix.messages import Camera, CameraVehicle, CandidateAttitude, Odometry, ServedVehicle, VehicleState, Verdict
 
 # Only what turns is compared: straight flight is the same for all.
 TURN_SPAN_NS = 500_000_000  # shortest time over which turns between frames are summed [measured: docs/decisions/052]
-MIN_RATE_RADPS = math.radians(4.0)  # of a turn that is compared [measured: docs/decisions/052]
-PAUSE_NS = 3_000_000_000  # without a turn, after which the next one is another manoeuvre [measured: docs/decisions/052]
+MIN_TURN_RATE_RADPS = math.radians(4.0)  # of a turn that is compared [measured: docs/decisions/052]
+# without a turn, after which the next one is another manoeuvre [measured: docs/decisions/052]
+TURN_PAUSE_NS = 3_000_000_000
 # An attitude turns as the images do: log of the likelihood ratio, all together and of a single turn (19 of 20 parts of
 # their mean square are explained), and manoeuvres, of which two may coincide by chance. With a camera on a vehicle that
 # is not on the link, of 120 vehicles there that turn otherwise 2 were confirmed in 300 s, both of them circling.
 MIN_EVIDENCE = 12.0  # [measured: docs/decisions/052]
 MIN_TURN_EVIDENCE = math.log(20.0)  # [measured: docs/decisions/052]
 MIN_MANOEUVRES = 3  # [measured: docs/decisions/052]
-OTHER_SHARE = (
-    0.5  # of the best evidence; another vehicle below it does not turn as the images do [measured: docs/decisions/052]
-)
+# of the best evidence; another vehicle below it does not turn as the images do [measured: docs/decisions/052]
+OTHER_SHARE = 0.5
 
 
 class _Vehicle:
@@ -76,9 +68,9 @@ class _Vehicle:
             turn = Turn(short.t0_ns, turn.t1_ns, short.yaw_rad + turn.yaw_rad)
         if turn.t1_ns - turn.t0_ns < TURN_SPAN_NS:
             self._short = turn
-        elif abs(turn.yaw_rad) >= MIN_RATE_RADPS * (turn.t1_ns - turn.t0_ns) * 1e-9:
+        elif abs(turn.yaw_rad) >= MIN_TURN_RATE_RADPS * (turn.t1_ns - turn.t0_ns) * 1e-9:
             newest, self._newest = self._newest, turn
-            if newest is None or turn.t0_ns - newest.t1_ns >= PAUSE_NS or newest.yaw_rad * turn.yaw_rad < 0.0:
+            if newest is None or turn.t0_ns - newest.t1_ns >= TURN_PAUSE_NS or newest.yaw_rad * turn.yaw_rad < 0.0:
                 self._manoeuvres += 1
             self.comparison.add(turn, self.telemetry)
         else:

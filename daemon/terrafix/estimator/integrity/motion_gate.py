@@ -37,6 +37,12 @@ class MotionInnovation:
         return Innovation(self.residual_m, self.cov_m2 + self._manoeuvre_m**2 * np.eye(3), GATE_D2)
 
     @property
+    def horizontal(self) -> Innovation:
+        """(2,) of ``with_manoeuvre``, east and north."""
+        whole = self.with_manoeuvre
+        return Innovation(whole.residual[:2], whole.covariance[:2, :2], GATE[2])
+
+    @property
     def _manoeuvre_m(self) -> float:
         """Displacement by the hardest manoeuvre."""
         return 0.5 * (MAX_MANOEUVRE_WITH_IMU_MPS2 if self.inertial else MAX_MANOEUVRE_MPS2) * self.dt_s**2

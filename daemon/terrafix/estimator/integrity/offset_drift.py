@@ -6,7 +6,7 @@ import numpy as np
 
 STEP_S = 0.05  # s: of the grid of offsets [tuned]
 # s: two seconds early (late telemetry), three late: what the camera source lets pass [spec: vision/sources/camera.py]
-GRID_S = np.arange(-2.0, 3.0001, STEP_S)
+DRIFT_GRID_S = np.arange(-2.0, 3.0001, STEP_S)
 RESOLUTION_S2 = STEP_S**2 / 12.0  # s^2 [spec: variance of a uniform density over a grid cell]
 # s/s at which an offset may drift; 0 first. A buffer fills by what a receiver is slower: 2 to 40 %, and empties again.
 RATES = np.array([0.0, -0.4, -0.1, 0.02, 0.05, 0.1, 0.2, 0.4])  # [spec: the last one fills the grid in 8 s]
@@ -28,7 +28,7 @@ def predicted(mass: np.ndarray, dt_s: float, hazards: Hazards) -> np.ndarray:
     moved = np.array([_shifted(row, rate * dt_s / STEP_S) for row, rate in zip(mass, RATES, strict=True)])
     after = transitions(dt_s, hazards).T @ moved
     jump = _chance(hazards.jump_hz, dt_s)
-    after[0] += jump * (float(moved[0].sum()) / len(GRID_S) - moved[0])
+    after[0] += jump * (float(moved[0].sum()) / len(DRIFT_GRID_S) - moved[0])
     return np.asarray(after)
 
 

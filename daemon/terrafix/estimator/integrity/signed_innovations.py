@@ -15,8 +15,9 @@ from terrafix.estimator.monitors.cusum import Cusum, threshold
 
 # Mean of the standardised innovations under the hypothesis of a wrong state: half of what a gate lets pass.
 SHIFT = 0.5 * math.sqrt(GATE[3])  # [spec: chi-square, 3 degrees of freedom, 99.9 %]
-STEPS_PER_HOUR = 36_000.0  # [spec: ten frames a second]
-FALSE_ALARM_HOURS = 1.0  # a false alarm costs seconds of a fix, a missed one is a wrong position [spec: one flight]
+INNOVATIONS_PER_HOUR = 36_000.0  # [spec: ten frames a second]
+# a false alarm costs seconds of a fix, a missed one is a wrong position [spec: one flight]
+INNOVATION_FALSE_ALARM_HOURS = 1.0
 AXES_AND_SIGNS = tuple((axis, sign) for axis in range(2) for sign in (1.0, -1.0))  # [spec: east and north, each sign]
 
 
@@ -24,7 +25,10 @@ class SignedInnovations:
     """``sum_m`` (2,): of the innovations of the present run, east and north: as far as the estimate has followed it."""
 
     def __init__(self) -> None:
-        self._tests = [Cusum(threshold(STEPS_PER_HOUR, len(AXES_AND_SIGNS), FALSE_ALARM_HOURS)) for _ in AXES_AND_SIGNS]
+        self._tests = [
+            Cusum(threshold(INNOVATIONS_PER_HOUR, len(AXES_AND_SIGNS), INNOVATION_FALSE_ALARM_HOURS))
+            for _ in AXES_AND_SIGNS
+        ]
         self.sum_m = np.zeros(2)
 
     def add(self, residual_m: np.ndarray, cov_m2: np.ndarray, share: float = 1.0) -> None:

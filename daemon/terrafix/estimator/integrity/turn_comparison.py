@@ -10,17 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.estimator.integrity.offset_drift import STEP_S
-from terrafix.estimator.integrity.time_offset import (
-    INDEPENDENT_SHARE,
-    REPORT_WAIT_NS,
-    UNSTAMPED_SHARE,
-)
+from terrafix.estimator.integrity.time_offset import REPORT_WAIT_NS, UNSTAMPED_SHARE
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.messages import STAMP_SIGMA_S
 
-GRID_S = np.arange(-2.0, 2.0001, STEP_S)  # s: offsets of the density [spec: offset_drift.py, to 2 s both ways]
-MIN_TURN_SIGMA_RAD = np.radians(0.3)  # lower limit of the 1-sigma of a turn between two frames [tuned]
+TURN_GRID_S = np.arange(-2.0, 2.0001, STEP_S)  # s: offsets of the density [spec: offset_drift.py, to 2 s both ways]
+MIN_COMPARED_TURN_SIGMA_RAD = np.radians(0.3)  # lower limit of the 1-sigma of a turn between two frames [tuned]
 MOUNT_PITCH_SIGMA_RAD = np.radians(1.5)  # 1-sigma of the mount pitch that remains after its calibration [tuned]
+INDEPENDENT_TURN_SHARE = 0.5  # of the turns: two consecutive ones share a frame [tuned]
 MEMORY_TURNS = 300.0  # turns: time constant of the exponential forgetting of the sums [tuned]
 
 
@@ -40,7 +37,7 @@ class TurnComparison:
         self._pending: list[Turn] = []  # until attitudes have arrived that are as late as the grid reaches
         # Sums over turns, for each offset of the grid: squares of the residual "visual less reported turn", products of
         # residual and change of roll, squares of the change of roll, squares of the visual and of the reported turn.
-        self._residual2, self._residual_roll, self._roll2, self._turned2 = np.zeros((4, len(GRID_S)))
+        self._residual2, self._residual_roll, self._roll2, self._turned2 = np.zeros((4, len(TURN_GRID_S)))
         self._count = 0.0
 
     def add(self, turn: Turn, telemetry: Telemetry) -> None:
@@ -51,7 +48,7 @@ class TurnComparison:
     def compare(self, telemetry: Telemetry, frame_ns: int) -> None:
         """Compares the turns for which all attitudes have arrived. ``frame_ns``: time stamp of the newest frame."""
         newest_ns = telemetry.newest_turn_ns
-        reach_ns = round(GRID_S[-1] * 1e9) + REPORT_WAIT_NS
+        reach_ns = round(TURN_GRID_S[-1] * 1e9) + REPORT_WAIT_NS
         while self._pending and self._pending[0].t1_ns + reach_ns <= newest_ns:
             self._accumulate(self._pending.pop(0), telemetry)
         while self._pending and self._pending[0].t1_ns + 2 * reach_ns < frame_ns:  # no heading is reported
@@ -63,26 +60,26 @@ class TurnComparison:
         independently of them", near 0 without turns; and the same for a single turn."""
         if self._count == 0.0:
             return 0.0, 0.0
-        prior = (1.0 - UNSTAMPED_SHARE) * _normal(GRID_S, STAMP_SIGMA_S)
-        prior += UNSTAMPED_SHARE / (GRID_S[-1] - GRID_S[0])
-        independent = self._turned2 / self._count + MIN_TURN_SIGMA_RAD**2
+        prior = (1.0 - UNSTAMPED_SHARE) * _normal(TURN_GRID_S, STAMP_SIGMA_S)
+        prior += UNSTAMPED_SHARE / (TURN_GRID_S[-1] - TURN_GRID_S[0])
+        independent = self._turned2 / self._count + MIN_COMPARED_TURN_SIGMA_RAD**2
         log = self._log_likelihood(self._noise) - self._log_likelihood(independent)
         total = float(log.max() + np.log(prior / prior.sum() @ np.exp(log - log.max())))
-        return total, total / (0.5 * INDEPENDENT_SHARE * self._count)
+        return total, total / (0.5 * INDEPENDENT_TURN_SHARE * self._count)
 
     @property
     def _noise(self) -> np.ndarray:
         """Variance of the residual turns at each offset, without what an error of the mount pitch explains [rad^2]."""
-        noise = self._residual2 / self._count + MIN_TURN_SIGMA_RAD**2
+        noise = self._residual2 / self._count + MIN_COMPARED_TURN_SIGMA_RAD**2
         by_mount = self._residual_roll**2 / (self._roll2 + noise / MOUNT_PITCH_SIGMA_RAD**2)
         return np.asarray(noise - by_mount / self._count)
 
     def _log_likelihood(self, variance: np.ndarray) -> np.ndarray:
         """Of the turns so far, whose ``variance`` is that of their own mean square."""
-        return np.asarray(-0.5 * INDEPENDENT_SHARE * self._count * np.log(variance))
+        return np.asarray(-0.5 * INDEPENDENT_TURN_SHARE * self._count * np.log(variance))
 
     def _accumulate(self, turn: Turn, telemetry: Telemetry) -> None:
-        shift_ns = np.round(GRID_S * 1e9).astype(np.int64)
+        shift_ns = np.round(TURN_GRID_S * 1e9).astype(np.int64)
         before, after = (telemetry.turned_about(t_ns - shift_ns) for t_ns in (turn.t0_ns, turn.t1_ns))
         if before is None or after is None:
             return

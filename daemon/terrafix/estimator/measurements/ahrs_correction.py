@@ -16,12 +16,7 @@ import numpy as np
 from terrafix.core.geodesy import euler_from_rot, rot_w_b
 from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.core.pose import exp_so3
-from terrafix.estimator.measurements.telemetry_buffer import (
-    TURN_UNSEEN_RAD,
-    UNKNOWN_ATTITUDE_RAD,
-    Attitude,
-    Telemetry,
-)
+from terrafix.estimator.measurements.telemetry_buffer import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD, Attitude, Telemetry
 from terrafix.estimator.models.motion_model import TILT_CORRELATION_S, WorldAcceleration
 
 # Of a rotation without the gyroscopes, what is no wrong correction: gyroscope bias hours after calibration (InvenSense

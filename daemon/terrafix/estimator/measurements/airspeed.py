@@ -23,7 +23,7 @@ from terrafix.estimator.state import HEADING, UP, NodeState
 from terrafix.messages import Verdict
 
 MIN_TAS_MPS = 8.0  # below stall speed, where a pitot tube reads noise [tuned]
-WIND_SIGMA_MPS, SCALE_SIGMA = 15.0, 0.1  # 1-sigma of the prior [tuned]
+WIND_SIGMA_MPS, AIRSPEED_SCALE_SIGMA = 15.0, 0.1  # 1-sigma of the prior [tuned]
 # A fixed wing in 7 m/s of wind (thor_flight75: 329 s, 20 to 80 m above the ground): velocity less airspeed and wind
 # scatters by 1.5 m/s along and 1.9 across, correlated over 4 s; the rest changes by 1.0 in half a minute.
 GUST_MPS, GUST_S = 1.5, 5.0  # [measured: flight log thor_flight75]
@@ -32,9 +32,8 @@ WIND_WALK, SCALE_WALK = 0.2, 5e-4  # [m/s] and relative, per square root of a se
 GUST_AVERAGE_S = 60.0  # time constant of the estimated gust strength [tuned]
 UPDATE_EVERY_S = 1.0  # [tuned]
 MAX_UPDATE_SIGMA_MPS = 3.0  # 1-sigma of a velocity that updates the wind, and of a wind that updates gusts [tuned]
-MAX_PREDICT_SIGMA_MPS = (
-    8.0  # of a predicted velocity: wind estimated on one heading is poorly known on the opposite one [tuned]
-)
+# of a predicted velocity: wind estimated on one heading is poorly known on the opposite one [tuned]
+MAX_PREDICT_SIGMA_MPS = 8.0
 MAX_TAS_CHANGE = 0.25  # relative, without odometry: autopilots hold airspeed, a tube that ices up does not [tuned]
 FUSION_TIMEOUT_S = 5.0  # after which a sensor that contradicts odometry is estimated anew [tuned]
 
@@ -96,7 +95,7 @@ class WindEstimator:
 
     def _reset(self) -> None:
         self._x = np.zeros(3)  # wind east, north [m/s], logarithm of true over read airspeed
-        self._p = np.diag([WIND_SIGMA_MPS, WIND_SIGMA_MPS, SCALE_SIGMA]) ** 2
+        self._p = np.diag([WIND_SIGMA_MPS, WIND_SIGMA_MPS, AIRSPEED_SCALE_SIGMA]) ** 2
         self._t_s: float | None = None  # of x and P
         self._read_mps = 0.0  # airspeed at that time
         self._rejected_s: float | None = None  # since when the airspeed has contradicted odometry

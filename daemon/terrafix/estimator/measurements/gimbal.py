@@ -18,7 +18,7 @@ BUFFER_REPORTS = 300  # 30 s at 10 Hz; the time offset looks back by less [spec:
 LATENCY_S = 0.1  # [spec: STREAMS_HZ of link/mavlink/message_rates.py]
 FROZEN_NS = 1_000_000_000  # reports without a change for so long are not measured [spec: MAX_GAP_NS of attitudes]
 # Least down component of the view that sees ground for a map match. [spec: MIN_DOWN_COMPONENT of vision/sources]
-MIN_DOWN = 0.2
+MIN_VIEW_DOWN = 0.2
 # Camera axes in those of the gimbal. [spec: OpenCV; MAVLink gimbal frame]
 LOOKING_ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -96,7 +96,7 @@ class GimbalReports:
         seen = slerp(np.array([t_ns]), times, q)
         age_ns = int(np.abs(times - t_ns).min()) if not times[0] <= t_ns <= times[1] else 0
         w, x, y, z = seen[0]
-        ground = 2.0 * float(x * z - w * y) >= MIN_DOWN  # down component of the gimbal's x axis
+        ground = 2.0 * float(x * z - w * y) >= MIN_VIEW_DOWN  # down component of the gimbal's x axis
         platform = _product(seen, np.array([quat_from_rot(self._r_c_p)]))[0]
         return Held(platform, both[1].from_north, age_ns, rate_radps * LATENCY_S, ground)
 

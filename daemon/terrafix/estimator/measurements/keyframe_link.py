@@ -12,7 +12,7 @@ from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.messages import Odometry, Verdict
 
-NAME = "link"  # in verdicts
+LINK_VERDICT = "link"  # in verdicts
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,12 @@ class LinkMeasurement:
         return Innovation(residual, cov + self.known.cov + self.motion.cov, GATE[6])
 
     def verdict(self, state: FilterState) -> FusionVerdict:
-        return self.innovation(state).verdict(NAME, f"keyframe {self.frame_id}")
+        return self.innovation(state).verdict(LINK_VERDICT, f"keyframe {self.frame_id}")
 
 
 def refused(odometry: Odometry, verdict: Verdict) -> FusionVerdict:
     """The verdict on a link that gives no motion."""
-    return FusionVerdict(NAME, verdict, None, f"keyframe {odometry.keyframe_id}")
+    return FusionVerdict(LINK_VERDICT, verdict, None, f"keyframe {odometry.keyframe_id}")
 
 
 def by_link(odometry: Odometry, i: int) -> Odometry:

@@ -22,12 +22,12 @@ from terrafix.estimator.measurements.telemetry_buffer import UNKNOWN_ATTITUDE_RA
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
-from terrafix.estimator.state import HEADING, HEIGHT, HORIZONTAL, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
+from terrafix.estimator.state import HEADING, HEIGHT, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import CovarianceMode, Odometry, Verdict
 
 # Verdicts on frames without a new view of the ground.
 NO_NEW_VIEW = (Verdict.BAD_IMAGE, Verdict.OVERTAKEN, Verdict.STALLED, Verdict.NO_GROUND)
-MAX_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
+MAX_ODOMETRY_SPEED_MPS = 80.0  # faster than any drone that this is made for [spec: design limit]
 HEADING_GATE = 3.0  # sigmas between the turn of a new fragment and the reported heading [tuned]
 
 
@@ -110,7 +110,7 @@ class OdometryMeasurement:
             wrong = not innovation.is_accepted or state.orientation.fault is not None
             if frozen or wrong or self._is_flipped(answer, frame, before, motion):
                 verdict = Verdict.STALLED if frozen else Verdict.IMPLAUSIBLE
-                state.image_jump = None if frozen else (t_s, motion.residual_m[HORIZONTAL])
+                state.image_jump = None if frozen else (t_s, motion.horizontal)
                 return GatedOdometry(verdict, None, alone, innovation=innovation, motion_innovation=motion)
             if not fragment.confirmed:
                 self._weigh_fragment(fragment, frame, answer, before, motion)
@@ -259,7 +259,7 @@ class OdometryMeasurement:
         if isinstance(motion, Verdict):
             return motion
         dt_s = max(odometry.t_ns * 1e-9 - state.graph.time_of(parent), 1e-3)
-        possible = float(np.linalg.norm(motion.p_m)) <= MAX_SPEED_MPS * dt_s + view.height_m
+        possible = float(np.linalg.norm(motion.p_m)) <= MAX_ODOMETRY_SPEED_MPS * dt_s + view.height_m
         return KeyframeMotion(parent, motion, odometry) if possible else Verdict.IMPLAUSIBLE
 
     def _expected_rotation(self, frame: FrameInput, keyframe: NodeState) -> tuple[np.ndarray, float]:

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from terrafix.core.geodesy import rot_w_b
 from terrafix.core.inertial import GRAVITY_MPS2, covers, rotate_to_world
+from terrafix.core.pose import log_so3
 from terrafix.estimator.measurements.gimbal import GimbalReports, euler_of
 from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.messages import Imu, VehicleState
@@ -20,14 +22,14 @@ BUFFER_STATES = 400  # 8 s at 50 Hz [tuned]
 # Two minutes at 25 and 50 Hz, for which a camera may fail; 30 s at 200 Hz.
 BUFFER_ATTITUDES, BUFFER_READINGS = 3000, 6000  # [tuned]
 STANDS_BELOW_M = 10.0  # drift of a barometer before take-off [tuned]
-MAX_GAP_NS = 1_000_000_000  # between a state and a frame [tuned]
+MAX_STATE_GAP_NS = 1_000_000_000  # between a state and a frame [tuned]
 BOX = np.linspace(-1.0, 1.0, 9)  # where reported angles are averaged about a time, in report intervals [tuned]
 REORDER_NS = 200_000_000  # by which states may come out of order [tuned]
 # Between readings, and from the last one to the frame: acceleration is interpolated linearly.
 MAX_READING_GAP_NS = 120_000_000  # [tuned]
-MAX_ATTITUDE_GAP_NS = (
-    260_000_000  # at 4 Hz, ArduPilot's default, a vehicle turns too far between two [spec: ATTITUDE rate]
-)
+RATE_SPAN_NS = 40_000_000  # on each side: two intervals of the requested attitudes [spec: STREAMS_HZ]
+# at 4 Hz, ArduPilot's default, a vehicle turns too far between two [spec: ATTITUDE rate]
+MAX_ATTITUDE_GAP_NS = 260_000_000
 
 
 Timed = tuple[np.ndarray, np.ndarray]  # times (N,) [ns], values (3, N)
@@ -55,7 +57,7 @@ class Attitude:
     @property
     def stale(self) -> float:
         """0 to 1: of the way from an attitude of the frame's time to one that is too far from it to be used."""
-        return self.stale_s * 1e9 / MAX_GAP_NS
+        return self.stale_s * 1e9 / MAX_STATE_GAP_NS
 
     @property
     def stands(self) -> bool:
@@ -64,8 +66,8 @@ class Attitude:
 
 
 LEANS_RAD = np.radians(2.0)  # twice the 1-sigma of a reported tilt [spec: attitude_sigma_deg]
-_ANGLES = ("yaw_rad", "pitch_rad", "roll_rad")
-_FIELDS = (*_ANGLES, "agl_m", "armed", "airspeed_mps")
+_ATTITUDE_ANGLES = ("yaw_rad", "pitch_rad", "roll_rad")
+_FIELDS = (*_ATTITUDE_ANGLES, "agl_m", "armed", "airspeed_mps")
 
 
 class Telemetry:
@@ -103,7 +105,7 @@ class Telemetry:
             yaw_rad = float(angles[0])
         elif yaw_rad is not None:
             yaw_rad += float(angles[0])
-        if held is None or held.age_ns > MAX_GAP_NS or self._repeats():
+        if held is None or held.age_ns > MAX_STATE_GAP_NS or self._repeats():
             lost = replace(platform, yaw_rad=yaw_rad, turned_rad=TURN_UNSEEN_RAD, righted_rad=UNKNOWN_ATTITUDE_RAD)
             pitches, rolls = (axis not in self.gimbal.stabilised for axis in ("pitch", "roll"))
             if not (pitches or rolls):
@@ -131,8 +133,8 @@ class Telemetry:
         unsettled = list(_FIELDS)
         for state in reversed(self._states):
             away_ns = abs(state.t_ns - t_ns)
-            if away_ns > MAX_GAP_NS:
-                if state.t_ns < t_ns - 2 * MAX_GAP_NS:
+            if away_ns > MAX_STATE_GAP_NS:
+                if state.t_ns < t_ns - 2 * MAX_STATE_GAP_NS:
                     break  # they come in order of time, but for REORDER_NS
                 continue
             for name in unsettled.copy():
@@ -144,7 +146,7 @@ class Telemetry:
             if not unsettled:
                 break
         nearest = {name: value for name, (_, value) in best.items()}
-        away_ns = max((best[name][0] for name in _ANGLES if name in best), default=0)
+        away_ns = max((best[name][0] for name in _ATTITUDE_ANGLES if name in best), default=0)
         stale_s = max(0, away_ns - MAX_ATTITUDE_GAP_NS // 2) * 1e-9
         return replace(Attitude(*(nearest.get(name) for name in _FIELDS)), stale_s=stale_s)  # type: ignore[arg-type]
 
@@ -180,7 +182,7 @@ class Telemetry:
     def turned_about(self, t_ns: np.ndarray) -> np.ndarray | None:
         """Reported yaw, pitch and roll (3, N) about times (N,) [ns], unwrapped: means over two report intervals, whose
         noise is the same at a report and between two. None where attitudes do not cover that."""
-        turns = self._turns.around(int(t_ns.min()) - MAX_GAP_NS, int(t_ns.max()) + MAX_GAP_NS)
+        turns = self._turns.around(int(t_ns.min()) - MAX_STATE_GAP_NS, int(t_ns.max()) + MAX_STATE_GAP_NS)
         if turns is None:
             return None
         about_ns = np.median(np.diff(turns[0])) * BOX
@@ -189,29 +191,68 @@ class Telemetry:
         at_ns = t_ns[:, None] + about_ns
         return np.stack([np.interp(at_ns, turns[0], angle).mean(axis=1) for angle in _unwrapped(turns[1])])
 
-    def attitudes_about(self, t_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """-> R_w_b (N, 3, 3) about times (N,) [ns], as ``turned_about``, and sines of roll and pitch (N,), as complex
-        numbers; of what the camera is fixed to."""
+    def vehicle_rate_radps(self, t_ns: int) -> np.ndarray | None:
+        """(3,) of the vehicle about its axes forward, right and down at ``t_ns``, by the gyroscopes; by the attitudes
+        where there are none. None where neither covers that."""
+        rates = self._rates.around(t_ns - RATE_SPAN_NS, t_ns + RATE_SPAN_NS)
+        if rates is not None and np.abs(rates[0] - t_ns).min() <= MAX_READING_GAP_NS:
+            near = np.abs(rates[0] - t_ns) <= max(RATE_SPAN_NS, int(np.abs(rates[0] - t_ns).min()))
+            return np.asarray(rates[1][:, near].mean(axis=1))
+        turns = self._turns.around(t_ns - RATE_SPAN_NS, t_ns + RATE_SPAN_NS)
+        if turns is None or np.abs(turns[0] - t_ns).min() > MAX_ATTITUDE_GAP_NS:
+            return None
+        first, last = (rot_w_b(*turns[1][:, at]) for at in (0, -1))
+        return np.asarray(log_so3(first.T @ last)) / ((turns[0][-1] - turns[0][0]) * 1e-9)
+
+    def attitudes_about(self, t_ns: np.ndarray) -> np.ndarray | None:
+        """-> R_w_b (N, 3, 3) about times (N,) [ns], as ``turned_about``, of what the camera is fixed to."""
         angles = self.turned_about(t_ns)
         if angles is not None and self.gimbal.used:
             angles = self.gimbal.angles_about(t_ns, angles[0])
         if angles is None:
             return None
-        r_w_b = np.stack([rotate_to_world([*axis], *angles) for axis in np.eye(3)], axis=2)
-        return r_w_b, np.sin(angles[2]) + 1j * np.sin(angles[1])
+        return np.stack([rotate_to_world([*axis], *angles) for axis in np.eye(3)], axis=2)
 
     def velocity_changes(self, t0_ns: int, t1_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
         """(N,) complex, east + j north [m/s]: change of velocity from ``t0_ns`` to ``t1_ns``, both less each of
         ``offset_s`` (N,). None when readings or attitudes do not cover that."""
         first_ns, last_ns = t0_ns - round(offset_s.max() * 1e9), t1_ns - round(offset_s.min() * 1e9)
-        world = self.world_acceleration(first_ns, last_ns)
+        known = self._velocities(first_ns, last_ns)
+        if known is None:
+            return None
+        before, after = (np.interp((t_ns - first_ns) * 1e-9 - offset_s, *known) for t_ns in (t0_ns, t1_ns))
+        return np.asarray(after - before)
+
+    def velocities(self, t_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
+        """(N,) complex, east + j north [m/s]: velocity at ``t_ns`` less each of ``offset_s`` (N,), but for a constant;
+        the newest one for times that come later. None when readings or attitudes do not cover that."""
+        first_ns, last_ns = t_ns - round(offset_s.max() * 1e9), t_ns - round(offset_s.min() * 1e9)
+        known = self._velocities(first_ns, min(last_ns, self._forces.newest_ns, self._turns.newest_ns))
+        return None if known is None else np.interp((t_ns - first_ns) * 1e-9 - offset_s, *known)
+
+    def _velocities(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """-> seconds since ``t0_ns`` (M,), and by how much the velocity has changed since then (M,), complex."""
+        world = self.world_acceleration(t0_ns, t1_ns)
         if world is None:
             return None
         accel_mps2 = world.accel_w_mps2[:, 0] + 1j * world.accel_w_mps2[:, 1]
-        mps = np.concatenate([[0.0], np.cumsum(0.5 * (accel_mps2[1:] + accel_mps2[:-1]) * np.diff(world.s_s))])
-        ends = (np.interp((t_ns - first_ns) * 1e-9 - offset_s, world.s_s, mps) for t_ns in (t0_ns, t1_ns))
-        before, after = ends
-        return np.asarray(after - before)
+        mps = np.cumsum(0.5 * (accel_mps2[1:] + accel_mps2[:-1]) * np.diff(world.s_s))
+        return world.s_s, np.concatenate([[0.0], mps])
+
+    def turns_by_gyro(self, t0_ns: int, t1_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
+        """(N, 3): rotation of the vehicle about east, north and up [rad] from ``t0_ns`` to ``t1_ns``, both less each of
+        ``offset_s`` (N,), by the gyroscopes. None when readings or attitudes do not cover that, or when a gimbal holds
+        the camera."""
+        first_ns, last_ns = t0_ns - round(offset_s.max() * 1e9), t1_ns - round(offset_s.min() * 1e9)
+        known = None if self.gimbal.used else self._with_attitudes(self._rates, first_ns, last_ns)
+        if known is None:
+            return None
+        (t_g, rates), (t_a, angles) = known
+        rates_w = rotate_to_world([*rates], *(np.interp(t_g, t_a, angle) for angle in _unwrapped(angles)))
+        s_s = (t_g - t_g[0]) * 1e-9
+        turned = np.vstack([np.zeros(3), np.cumsum(0.5 * (rates_w[1:] + rates_w[:-1]) * np.diff(s_s)[:, None], axis=0)])
+        at_s = [(t_ns - t_g[0]) * 1e-9 - offset_s for t_ns in (t0_ns, t1_ns)]
+        return np.column_stack([np.interp(at_s[1], s_s, axis) - np.interp(at_s[0], s_s, axis) for axis in turned.T])
 
     def turn_without_gyro(self, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, float] | None:
         """-> rotation (3,) about east, north and up [rad] by which the attitude turned from ``t0_ns`` to ``t1_ns`` and

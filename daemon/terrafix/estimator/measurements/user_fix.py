@@ -14,7 +14,7 @@ from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.relocalization import NO_INFORMATION_M2
 from terrafix.messages import Verdict
 
-NAME = "user_fix"
+USER_FIX_VERDICT = "user_fix"
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class UserFixMeasurement:
 
     at_m: np.ndarray
     sigma_m: float
-    name: str = NAME
+    name: str = USER_FIX_VERDICT
 
     def innovation(self, state: FilterState, node: int) -> Innovation:
         pose = state.graph.state(node).pose
@@ -39,13 +39,13 @@ def apply_user_fix(state: FilterState, frame_id: int, fix: UserFixMeasurement) -
     """Gates a fix of a frame in the window, and adds it. An accepted one joins the fragment of its frame."""
     node = state.node_of.get(frame_id)
     if node is None or not state.graph.holds(node):
-        return FusionVerdict(NAME, Verdict.STALE, None, "frame has left the window")
+        return FusionVerdict(USER_FIX_VERDICT, Verdict.STALE, None, "frame has left the window")
     if state.yaw_gauge is not None:
-        return FusionVerdict(NAME, Verdict.NO_PREDICTION, None, "the heading is unknown")
+        return FusionVerdict(USER_FIX_VERDICT, Verdict.NO_PREDICTION, None, "the heading is unknown")
     away_m = float(np.hypot(*(fix.at_m - state.graph.state(node).pose.translation()[:2])))
     fusion = fuse(state, node, fix)
     if fusion.verdict is Verdict.ACCEPTED:
         state.refresh_newest()
         state.fragments.of(node).join()
         state.on_placed()
-    return FusionVerdict(NAME, fusion.verdict, fusion.innovation, f"{away_m:.0f} m from the estimate")
+    return FusionVerdict(USER_FIX_VERDICT, fusion.verdict, fusion.innovation, f"{away_m:.0f} m from the estimate")

@@ -12,7 +12,7 @@ RADIAL_K1_PER_FOCAL_SIGMA = 1.5
 PRINCIPAL_POINT_PER_FOCAL_SIGMA = 0.2
 # 1-sigma of the focal length at which a camera counts as calibrated: its principal point is then known to a pixel or
 # two. [tuned]
-CALIBRATED_FOCAL_SIGMA = 0.01
+MAX_CALIBRATED_FOCAL_SIGMA = 0.01
 
 
 def radial_k1_sigma(camera: Camera) -> float:
@@ -27,6 +27,6 @@ def principal_point_sigma(camera: Camera) -> float:
 
     An equal offset of all rays cannot be told from a shift of position, by any image or map. So it does not average out
     over fixes, like the map's own error."""
-    if camera.focal_sigma <= CALIBRATED_FOCAL_SIGMA:
+    if camera.focal_sigma <= MAX_CALIBRATED_FOCAL_SIGMA:
         return 0.0
     return PRINCIPAL_POINT_PER_FOCAL_SIGMA * camera.focal_sigma * camera.width / camera.fx

@@ -41,7 +41,7 @@ MIN_TURN_RAD = np.radians(5.0)
 # 1-sigma of acceleration, m/s^2, while the vehicle has not been seen to fly: a take-off run, a launch by hand, the
 # start of a climb. A simulated plane has 10 m/s^2. [tuned]
 LAUNCH_MPS2 = np.array([6.0, 6.0, 5.0])
-MIN_SPEED_MPS = 5.0  # lower bound of the speed in the model: a hovering vehicle may have begun to fly [tuned]
+MIN_MODEL_SPEED_MPS = 5.0  # lower bound of the speed in the model: a hovering vehicle may have begun to fly [tuned]
 # With IMU: share of the variance of the autopilot's attitude that is time-varying, and its correlation time. The rest
 # is a board that is not level. The tilt of a real fixed wing changed by 0.9 degrees in 10 s, of a copter by 1.5: of 0.7
 # degrees that are stated, 0.65 vary. [measured: docs/simulated-flights.md]
@@ -147,7 +147,7 @@ def velocity_correlation_time_s(speed_mps: float) -> float:
 
     The stationary variance of a velocity with correlation time T, driven by an acceleration of variance a^2 and
     correlation time M, is a^2 T^2 M / (T + M) for each of two axes; this solves it for T."""
-    speed = max(speed_mps, MIN_SPEED_MPS)
+    speed = max(speed_mps, MIN_MODEL_SPEED_MPS)
     share = float(acceleration_noise_sigma(False, speed, 0.0)[0] / speed) ** 2
     half = 0.25 / MANOEUVRE_CORRELATION_S
     return (half + float(np.sqrt(half**2 + 0.5 * share))) / share

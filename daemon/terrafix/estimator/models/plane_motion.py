@@ -12,17 +12,17 @@ from terrafix.estimator.state import HORIZONTAL, ROTATION, TRANSLATION, UP
 
 EFFECTIVE_PAIRS = 16.0  # most independent matches: relief moves whole blocks of matches together [tuned]
 # 1-sigma of the mean ground level, share of the height, beyond the height's own error: houses and trees. [tuned]
-SCALE_SIGMA = 0.02
+LEVEL_SCALE_SIGMA = 0.02
 ROOF_SCALE_SIGMA = 0.12  # ... further, where hardly any match lies on the plane: tall buildings seen from 100 m [tuned]
-MIN_PAIRS = 8  # matches [tuned]
+MIN_MOTION_PAIRS = 8  # matches [tuned]
 FIRST_TOLERANCE = 1e-3  # convergence, rad and relative metres: the graph solves again, from the same rays [tuned]
 # Largest tilt change beyond the guess: matches in a narrow band confuse translation and tilt, and a wrong tilt rarely
 # fits. A motion that fits as well as the matches allow may have a larger change where tilt is not reported: a vehicle
 # leans into a turn. [tuned]
-MAX_TILT_CHANGE_RAD = np.radians(15.0)
+MAX_MOTION_TILT_CHANGE_RAD = np.radians(15.0)
 TILT_SIGMAS = 5.2  # of the difference of two tilts of equal sigma [spec: root of twice the chi-square, 2 dof, 99.9 %]
 GOOD_FIT = 1.3  # residual sigma over stated sigma: three sigmas of the median of 48 [spec: order statistics]
-MIN_DOWN = -0.2  # up component of a unit-depth ray: the ground lies within five heights [tuned]
+MAX_RAY_UP = -0.2  # up component of a unit-depth ray: the ground lies within five heights [tuned]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Ground:
     slope_e: float = 0.0
     slope_n: float = 0.0
     slope_sigma: float = 0.0
-    level_share: float = SCALE_SIGMA
+    level_share: float = LEVEL_SCALE_SIGMA
     curvature_sigma: float = 0.0
     rise_sigma_m: float = 0.0
     share: float = 1.0
@@ -109,17 +109,17 @@ def relative_pose(
     ``sigma_norm``; ``r_w_kf`` and ``ground`` give the plane; ``r_w_k`` is a first guess of the camera, whose tilt is
     known to ``tilt_sigma_rad``, because a plane seen from two places has a mirror solution. None: the matches do not
     determine the motion."""
-    if len(pairs) < MIN_PAIRS:
+    if len(pairs) < MIN_MOTION_PAIRS:
         return None
     pairs = np.hstack([undistort_division(pairs[:, :2], k1), undistort_division(pairs[:, 2:], k1)])
     rays_w = np.column_stack([pairs[:, :2], np.ones(len(pairs))]) @ r_w_kf.T
     rays_k = np.column_stack([pairs[:, 2:], np.ones(len(pairs))]) @ r_w_k.T
-    downward = (rays_w[:, UP] < MIN_DOWN) & (rays_k[:, UP] < MIN_DOWN)
-    if downward.sum() < MIN_PAIRS:
+    downward = (rays_w[:, UP] < MAX_RAY_UP) & (rays_k[:, UP] < MAX_RAY_UP)
+    if downward.sum() < MIN_MOTION_PAIRS:
         return None
     slope = np.array([ground.slope_e, ground.slope_n])
     height_m = ground.height_m
-    depth = height_m / np.maximum(rays_w[downward, HORIZONTAL] @ slope - rays_w[downward, UP], -MIN_DOWN / 2)
+    depth = height_m / np.maximum(rays_w[downward, HORIZONTAL] @ slope - rays_w[downward, UP], -MAX_RAY_UP / 2)
     points = rays_w[downward] * depth[:, None]  # world axes, origin at the keyframe
     offsets = rays_k[downward, :2] / -rays_k[downward, 2:] * height_m
     turn, scale, shift = _similarity(offsets, points[:, :2])
@@ -139,7 +139,7 @@ def relative_pose(
         return None
     tilt_change_rad = float(np.linalg.norm(log_so3((turn @ r_w_k).T @ fit.r_w_c)[:2]))
     allowed_rad = TILT_SIGMAS * tilt_sigma_rad if fit.sigma < GOOD_FIT * sigma_norm else 0.0
-    if tilt_change_rad > max(MAX_TILT_CHANGE_RAD, allowed_rad):
+    if tilt_change_rad > max(MAX_MOTION_TILT_CHANGE_RAD, allowed_rad):
         return None
     cov = fit.cov.copy()
     # An error of the height scales the translation. The tangent's translation is in the axes of the new camera.

@@ -24,7 +24,7 @@ FAULT_SIGMA_M = 1000.0  # m: least 1-sigma per horizontal axis while the descrip
 MIN_TURN_SPACING_S = 1.0  # s between turns that count: images of one keyframe share their errors [tuned]
 # Constant errors, 1-sigma, beyond the configured ones: heading [rad] of a compass beside motors, and height as a share
 # of it, of a barometer over uneven ground. [tuned]
-HEADING_SIGMA_RAD, HEIGHT_SIGMA_SHARE = math.radians(10.0), 0.05
+MATCH_HEADING_SIGMA_RAD, HEIGHT_SIGMA_SHARE = math.radians(10.0), 0.05
 YAW_NOISE_RAD = math.radians(3.0)  # 1-sigma of the heading of one pose against the reported one [tuned]
 REPORT_CHANGE = 0.2  # relative change of a factor or an angle after which a fault is reported again [tuned]
 # Faults whose images are refused from the frame on that shows them: the rest of the estimate is right.
@@ -62,7 +62,7 @@ class Monitors:
         self._shape = ShapeMonitor()
         self.agreement = Agreement()
         self._registration = Registration(self.agreement)
-        heading = math.hypot(HEADING_SIGMA_RAD, math.radians(origin.yaw_sigma_deg))
+        heading = math.hypot(MATCH_HEADING_SIGMA_RAD, math.radians(origin.yaw_sigma_deg))
         self._heading = OffsetMonitor(heading, YAW_NOISE_RAD)
         self._height: OffsetMonitor | None = None  # None until a height is reported
         self._times_ns: dict[int, int] = {}  # frame -> time, of frames that may be the keyframe of a later one

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
-from terrafix.estimator.monitors.cusum import Cusum, threshold
-from terrafix.estimator.monitors.levelling import MISFIT_MEMORY, STEPS_PER_HOUR
+from terrafix.estimator.monitors.cusum import COMPARISONS_PER_HOUR, Cusum, threshold
+from terrafix.estimator.monitors.levelling import MISFIT_MEMORY
 from terrafix.estimator.monitors.visual_motion import ground_residual
 
 # Scale of the image's x axis over that of its y axis: 4:3 and 16:9, 16:9 and 3:2, each taken for the other.
@@ -27,7 +27,7 @@ class ShapeMonitor:
     """One CUSUM per ratio."""
 
     def __init__(self) -> None:
-        limit = threshold(STEPS_PER_HOUR, len(ASPECT_RATIOS))
+        limit = threshold(COMPARISONS_PER_HOUR, len(ASPECT_RATIOS))
         self._tests = {ratio: Cusum(limit) for ratio in ASPECT_RATIOS}
         self._misfits = dict.fromkeys(ASPECT_RATIOS, 0.0)  # squared residuals: select among active ratios
 

@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
-from terrafix.estimator.monitors.cusum import Cusum, threshold
+from terrafix.estimator.monitors.cusum import COMPARISONS_PER_HOUR, Cusum, threshold
 from terrafix.estimator.monitors.visual_motion import visual_motion
 
-STEPS_PER_HOUR = 3600.0  # 1/h: at most one comparison a second [spec: MIN_TURN_SPACING_S]
 TILT_CHANGE_SIGMA_RAD = np.radians(0.7)  # 1-sigma of a reported change of tilt between two frames [tuned]
 ACCELERATION_SIGMA_MPS2 = 3.0  # m/s^2, 1-sigma of a vehicle's acceleration [tuned]
 MISFIT_MEMORY = 0.95  # exponential forgetting of the misfit of a fault, per comparison [tuned]
@@ -56,7 +55,7 @@ class LevellingMonitor:
     """One CUSUM per fault."""
 
     def __init__(self) -> None:
-        limit = threshold(STEPS_PER_HOUR, len(TILT_FAULTS))
+        limit = threshold(COMPARISONS_PER_HOUR, len(TILT_FAULTS))
         self._tests = {name: Cusum(limit) for name in TILT_FAULTS}
         self._misfits = dict.fromkeys(TILT_FAULTS, 0.0)  # squared jumps in sigmas: select among active faults
         self._last: _Velocity | None = None

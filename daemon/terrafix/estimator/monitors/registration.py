@@ -6,7 +6,8 @@ import math
 
 from terrafix.core.agreement import RANGES, Agreement, Cause, Observed
 
-MIN_SPACING_HEIGHTS = 0.25  # heights flown between two correlations that count: closer ones see the same ground [tuned]
+# heights flown between two correlations that count: closer ones see the same ground [tuned]
+REGISTRATION_SPACING_HEIGHTS = 0.25
 # Position error per path length in the worst case, a heading that is off by 180 degrees.
 ERROR_PER_PATH = 2.0  # [spec: geometry]
 
@@ -35,7 +36,7 @@ class Registration:
         """A correlation over textured ground. ``found``: the estimator accepted a camera pose on the map."""
         if found and not self.active:
             self._path_m = 0.0
-        if self._heights < MIN_SPACING_HEIGHTS:
+        if self._heights < REGISTRATION_SPACING_HEIGHTS:
             return
         self._heights = 0.0
         self._agreement.observe(Observed.POSE if found else Observed.NOTHING, Cause.DESCRIPTION)

@@ -2,9 +2,8 @@
 
 import math
 
-from terrafix.estimator.monitors.cusum import Cusum, threshold
+from terrafix.estimator.monitors.cusum import COMPARISONS_PER_HOUR, Cusum, threshold
 
-STEPS_PER_HOUR = 3600.0  # 1/h: at most one turn a second [spec: MIN_TURN_SPACING_S]
 VISUAL_TURN_SIGMA_RAD = math.radians(1.0)  # 1-sigma of a turn between two images [tuned]
 
 
@@ -13,7 +12,7 @@ class TurnMonitor:
 
     def __init__(self, yaw_sigma_rad: float) -> None:
         self._variance = VISUAL_TURN_SIGMA_RAD**2 + 2.0 * yaw_sigma_rad**2
-        self._test = Cusum(threshold(STEPS_PER_HOUR))
+        self._test = Cusum(threshold(COMPARISONS_PER_HOUR))
 
     @property
     def mirrored(self) -> bool:

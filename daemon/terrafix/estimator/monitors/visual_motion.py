@@ -9,8 +9,8 @@ from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.plane_motion import similarity_ratio
 
 # Smallest down component of a unit-depth ray: it meets the ground within five heights.
-MIN_DOWN = 0.2  # [spec: 1 / 5]
-MIN_PAIRS = 8  # point pairs [tuned]
+MIN_RAY_DOWN = 0.2  # [spec: 1 / 5]
+MIN_VELOCITY_PAIRS = 8  # point pairs [tuned]
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ def _ground_points(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """-> where the rays of the keyframe and of the frame, complex (N,), meet the ground, east + j north from each
     camera, in heights."""
-    if len(pairs) < MIN_PAIRS:
+    if len(pairs) < MIN_VELOCITY_PAIRS:
         return None
     rays_kf, rays_k = (_rays(pairs[:, i : i + 2], a, r_b_c) for i, a in ((0, before), (2, now)))
-    down = (rays_kf[:, 2] < -MIN_DOWN) & (rays_k[:, 2] < -MIN_DOWN)
-    if int(down.sum()) < MIN_PAIRS:
+    down = (rays_kf[:, 2] < -MIN_RAY_DOWN) & (rays_k[:, 2] < -MIN_RAY_DOWN)
+    if int(down.sum()) < MIN_VELOCITY_PAIRS:
         return None
     kf, k = (rays[down, 0] / -rays[down, 2] + 1j * rays[down, 1] / -rays[down, 2] for rays in (rays_kf, rays_k))
     return kf, k

@@ -1,12 +1,12 @@
 """Continuity check of the time since boot in an autopilot's messages. A step is rejected until only the new time has
-been received for ``CONFIRM_NS``: the autopilot has then rebooted, and its time continues from there."""
+been received for ``BOOT_CONFIRM_NS``: the autopilot has then rebooted, and its time continues from there."""
 
 from terrafix.core.clock import NS_PER_MS
 
 WRAP_MS = 2**32  # time_boot_ms has 32 bits: it wraps after 49.7 days [spec: MAVLink common.xml]
 MAX_BACKWARD_STEP_MS = 1_000  # messages may arrive out of order [tuned]
 MAX_FORWARD_STEP_MS = 5_000  # beyond the elapsed time: the previous message may have been delayed so long [tuned]
-CONFIRM_NS = 1_000_000_000  # time for which only the new time must be received [tuned]
+BOOT_CONFIRM_NS = 1_000_000_000  # time for which only the new time must be received [tuned]
 
 
 def boot_step_ms(before_ms: int, after_ms: int) -> int:
@@ -50,7 +50,7 @@ class BootClock:
         step_s = boot_step_ms(self._clock.newest_ms, boot_ms) / 1e3
         if self._candidate is None or not self._candidate.accepts(boot_ms, now_ns):
             self._candidate = _ClockTrack(boot_ms, now_ns)
-        if now_ns - self._candidate.start_ns < CONFIRM_NS:
+        if now_ns - self._candidate.start_ns < BOOT_CONFIRM_NS:
             return f"time since boot steps by {step_s:.1f} s"
         self._clock, self._candidate = self._candidate, None
         self.reboots += step_s < 0

@@ -4,13 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
-from terrafix.messages import MeasurementVerdict, Verdict
+from terrafix.messages import NO_FRAME_ID, MeasurementVerdict, Verdict
 
-VERDICT_PERIOD_NS = 1_000_000_000  # shortest time between two verdicts for the same reason [tuned]
+REFUSAL_PERIOD_NS = 1_000_000_000  # shortest time between two verdicts for the same reason [tuned]
 EPISODE_TIMEOUT_NS = 10_000_000_000  # an episode ends after this time without a rejection [tuned]
 # Rejected messages of an episode before the pilot is informed; a gap in the sequence numbers alone costs five. [tuned]
 MIN_PILOT_TEXT_MESSAGES = 10
-NO_FRAME_ID = -1  # frame_id of a verdict that belongs to no frame [spec: MeasurementVerdict]
 
 
 class RejectionReason(StrEnum):
@@ -58,7 +57,7 @@ class RejectionLog:
         """-> one verdict per reason: at its first rejection, then at most one per second with the message count."""
         for reason, episode in self._episodes.items():
             if not episode.unreported or (
-                episode.reported_ns is not None and now_ns - episode.reported_ns < VERDICT_PERIOD_NS
+                episode.reported_ns is not None and now_ns - episode.reported_ns < REFUSAL_PERIOD_NS
             ):
                 continue
             times = f" ({episode.unreported} messages)" if episode.unreported > 1 else ""

@@ -17,6 +17,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.clock import NS_PER_S
+from terrafix.core.mavlink.vehicles import AUTOPILOT_COMPONENT
 from terrafix.link.autopilot.checkpoint import LinkCheckpoint
 from terrafix.link.mavlink.transport import MAX_PEERS, Address
 
@@ -35,8 +36,6 @@ OTHER_TIMEOUT_NS = 10 * NS_PER_S  # silence after which another sender is forgot
 # [spec: MAVLink heartbeat protocol, 1 Hz]
 LISTEN_NS = 3 * NS_PER_S // 2
 MAX_RIVALS = MAX_PEERS - 1  # whose turns are compared; of more vehicles one has to be named [spec: transport.py]
-# Ground stations, cameras and other companions send heartbeats as well; an autopilot's names its firmware.
-AUTOPILOT_COMPONENT = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 
 class Role(Enum):

@@ -1,5 +1,5 @@
 """Consistency check of the autopilot's attitude with its gyroscopes. An attitude that jumps is rejected until only the
-new attitude has been received for ``CONFIRM_NS``.
+new attitude has been received for ``ATTITUDE_CONFIRM_NS``.
 
 An AHRS corrects its attitude slowly; estimator/measurements/ahrs_correction.py handles such corrections. A jump comes
 from another sender, or from a reset of the AHRS: in that case the attitude continues from the new value, and the old
@@ -21,13 +21,14 @@ from terrafix.core.pose import exp_so3
 JUMP_RAD = math.radians(5.0)  # [tuned]
 TURN_ERROR_SHARE = 0.1  # of the turned angle: errors of timing, scale and alignment of the gyroscopes [tuned]
 ENDPOINT_TURN_ERROR_SHARE = 0.5  # the same, if only the rates at the two attitudes are known [tuned]
-MAX_GAP_NS = 150_000_000  # longest gap between gyroscope readings that cover the time between two attitudes [tuned]
+# longest gap between gyroscope readings that cover the time between two attitudes [tuned]
+MAX_GYRO_GAP_NS = 150_000_000
 # Between two attitudes without gyroscope readings (10 Hz, with jitter). In a longer time a copter can begin and end a
 # turn, which the rates at both ends do not show. [tuned]
 MAX_ENDPOINT_SPAN_NS = 130_000_000
 MAX_COMPARED_SPAN_NS = 1_000_000_000  # attitudes further apart are not compared [tuned]
 RATE_HISTORY_NS = 2_000_000_000  # gyroscope readings older than this are dropped [tuned]
-CONFIRM_NS = 1_000_000_000  # time for which only the new attitude must be received [tuned]
+ATTITUDE_CONFIRM_NS = 1_000_000_000  # time for which only the new attitude must be received [tuned]
 
 Vec3 = tuple[float, float, float]
 
@@ -79,7 +80,7 @@ class TurnCheck:
         if from_candidate_rad != 0.0:
             self._candidate_since_ns = attitude.boot_ns
         self._candidate = attitude
-        if attitude.boot_ns - self._candidate_since_ns < CONFIRM_NS:
+        if attitude.boot_ns - self._candidate_since_ns < ATTITUDE_CONFIRM_NS:
             degrees = math.degrees(from_accepted_rad or from_candidate_rad or 0.0)
             return f"jumps by {degrees:.0f} degrees that its gyroscopes did not turn"
         self._accepted, self._candidate = attitude, None
@@ -104,9 +105,9 @@ class TurnCheck:
 
         None if no gyroscope readings cover the time between."""
         dt_ns = after.boot_ns - before.boot_ns
-        rates = [r for r in self._rates if before.boot_ns - MAX_GAP_NS <= r[0] <= after.boot_ns + MAX_GAP_NS]
+        rates = [r for r in self._rates if before.boot_ns - MAX_GYRO_GAP_NS <= r[0] <= after.boot_ns + MAX_GYRO_GAP_NS]
         times = [before.boot_ns, *(t for t, _ in rates if before.boot_ns < t < after.boot_ns), after.boot_ns]
-        if not rates or max(b - a for a, b in pairwise(times)) > MAX_GAP_NS:
+        if not rates or max(b - a for a, b in pairwise(times)) > MAX_GYRO_GAP_NS:
             return _turn_from_endpoints(before, after, dt_ns)
         turn, path_rad = np.eye(3), 0.0
         for t0, t1 in pairwise(times):

@@ -17,18 +17,17 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.link.admission.boot_clock import boot_step_ms
-from terrafix.link.autopilot.gnss_receiver import FIX_2D, RECEIVERS
-from terrafix.link.integrity.fix_type import FIX_3D
+from terrafix.link.autopilot.ekf_status_monitor import NO_POSITION_FLAGS
+from terrafix.link.autopilot.gnss_receiver import RECEIVERS
 from terrafix.link.integrity.output_predictor import metres_per_degree, offset
-from terrafix.messages import EkfDeadReckoning, GpsInput
+from terrafix.messages import FIX_2D, FIX_3D, EkfDeadReckoning, GpsInput
 
 MAX_DEAD_RECKONING_MS = 60_000  # the time for which a restart counts as the same flight (runtime/run_dir.py) [tuned]
 MAX_FIX_INTERVAL_NS = 300_000_000  # longest interval between two fixes for interpolation between them [tuned]
-STATUS_TIMEOUT_NS = 1_500_000_000  # EKF_STATUS_REPORT arrives at 1 Hz [tuned]
+STATUS_REPORT_TIMEOUT_NS = 1_500_000_000  # EKF_STATUS_REPORT arrives at 1 Hz [tuned]
 RECEIVER_TIMEOUT_NS = 1_500_000_000  # receiver messages arrive at 5 Hz [tuned]
 REQUEST_PERIOD_NS, MAX_REQUESTS = 200_000_000, 10  # of the slow messages, after a restart [tuned]
 VELOCITY_FLAG = mavlink.EKF_VELOCITY_HORIZ
-NO_POSITION_FLAGS = mavlink.EKF_CONST_POS_MODE | mavlink.EKF_UNINITIALIZED
 
 Vec3 = tuple[float, float, float]
 
@@ -133,7 +132,7 @@ class DeadReckoningRecorder:
         if self._status is None or not last.receivers <= receivers:
             return False
         received_ns, velocity_valid = self._status
-        return velocity_valid and now_ns - received_ns < STATUS_TIMEOUT_NS
+        return velocity_valid and now_ns - received_ns < STATUS_REPORT_TIMEOUT_NS
 
 
 def _dead_reckoning_since(last: LastFix, ekf_state: EkfState, t_ns: int) -> Iterator[EkfDeadReckoning]:

@@ -11,7 +11,7 @@ from terrafix.messages import EkfStatus
 # Time from the first 3D fix after which the EKF must use it. Measured: an EKF on the ground takes 21 s until it uses a
 # GPS; in the air it returns to one after 10 s. [tuned]
 USE_TIMEOUT_NS = 30 * NS_PER_S
-STATUS_TIMEOUT_NS = 5 * NS_PER_S  # an older status is ignored [tuned]
+EKF_STATUS_TIMEOUT_NS = 5 * NS_PER_S  # an older status is ignored [tuned]
 NO_POSITION_FLAGS = mavlink.EKF_CONST_POS_MODE | mavlink.EKF_UNINITIALIZED
 
 
@@ -31,7 +31,7 @@ class EkfStatusMonitor:
         """``has_fix``: a 3D fix is sent now. -> (True if the EKF uses a position, text for the pilot)."""
         self._fix_since_ns = (self._fix_since_ns or now_ns) if has_fix else None
         status = self._status
-        if self._fix_since_ns is None or status is None or now_ns - status.t_ns > STATUS_TIMEOUT_NS:
+        if self._fix_since_ns is None or status is None or now_ns - status.t_ns > EKF_STATUS_TIMEOUT_NS:
             return
         uses_position = bool(status.flags & mavlink.EKF_POS_HORIZ_ABS) and not status.flags & NO_POSITION_FLAGS
         if not uses_position and now_ns - self._fix_since_ns < USE_TIMEOUT_NS:

@@ -2,10 +2,9 @@
 
 from typing import Any
 
-from terrafix.messages import GnssReading
+from terrafix.messages import FIX_2D, GnssReading
 
 RECEIVERS = {"GPS_RAW_INT": 0, "GPS2_RAW": 1}  # message -> receiver index [spec: MAVLink ardupilotmega.xml]
-FIX_2D = 2  # GPS_FIX_TYPE_2D_FIX [spec: MAVLink common.xml]
 UINT16_UNKNOWN = 65_535  # [spec: MAVLink common.xml]
 UINT8_UNKNOWN = 255  # [spec: MAVLink common.xml]
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.link.autopilot.gnss_receiver import RECEIVERS, gnss_reading
@@ -14,6 +15,7 @@ from terrafix.link.output.selection import AutopilotState
 from terrafix.messages import EkfStatus, Message, VehicleState
 
 ATTITUDE_TIMEOUT_NS = 500_000_000  # an older attitude is not used for the outputs [tuned]
+POSITION_TIMEOUT_NS = 1_000_000_000  # an older position of its EKF is not published [spec: EkfStatus]
 # The bits that mean the same in ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS. [spec: MAVLink common.xml]
 COMMON_EKF_FLAGS = 2 * mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS - 1
 
@@ -25,6 +27,7 @@ class PacketDecoder:
         self.telemetry = TelemetryDecoder(timesync)
         self._state: VehicleState | None = None  # the newest
         self._origin: GeodeticPoint | None = None  # of its EKF
+        self._position: tuple[int, float, float] | None = None  # of its EKF: time received, latitude, longitude
 
     @property
     def sysid(self) -> int:
@@ -42,18 +45,27 @@ class PacketDecoder:
             if isinstance(state, VehicleState):
                 self._state = state
             yield state
-        gimbal = self.telemetry.on_gimbal(message, now_ns)
-        if gimbal is not None:
-            yield gimbal
+        for other in (self.telemetry.on_gimbal(message, now_ns), self.telemetry.on_exposure(message, now_ns)):
+            if other is not None:
+                yield other
         kind = message.get_type()
         if kind in RECEIVERS and RECEIVERS[kind] != own_receiver:
             yield gnss_reading(message, now_ns)
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._origin = GeodeticPoint(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+        elif kind == "GLOBAL_POSITION_INT":
+            self._position = now_ns, message.lat / 1e7, message.lon / 1e7
         elif kind == "EKF_STATUS_REPORT":
-            yield from _ekf_status(message, now_ns)
+            for status in _ekf_status(message, now_ns):
+                yield self._with_position(status)
         elif kind == "ESTIMATOR_STATUS":
-            yield _estimator_status(message, now_ns)
+            yield self._with_position(_estimator_status(message, now_ns))
+
+    def _with_position(self, status: EkfStatus) -> EkfStatus:
+        if self._position is None or status.t_ns - self._position[0] > POSITION_TIMEOUT_NS:
+            return status
+        _, lat_deg, lon_deg = self._position
+        return msgspec.structs.replace(status, lat_deg=lat_deg, lon_deg=lon_deg)
 
     def snapshot(self, now_ns: int) -> AutopilotState:
         """-> the state that the outputs need, without the attitude if that is too old."""

@@ -10,16 +10,18 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.clock import NS_PER_MS
 from terrafix.core.mavlink.airspeed import AirspeedReader
+from terrafix.core.mavlink.exposure import exposure_of
 from terrafix.core.mavlink.gimbal import ATTITUDE_MESSAGES, GimbalReader
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
 from terrafix.core.mavlink.imu import IMU_MESSAGES, ImuStreamSelector, boot_ns, imu_readings
+from terrafix.core.mavlink.vehicles import AUTOPILOT_COMPONENT
 from terrafix.link.admission.boot_clock import WRAP_MS
-from terrafix.link.admission.served_autopilot import AUTOPILOT_COMPONENT, is_autopilot_heartbeat
+from terrafix.link.admission.served_autopilot import is_autopilot_heartbeat
 from terrafix.link.autopilot.checkpoint import ArmedAutopilot, LinkCheckpoint
 from terrafix.link.autopilot.pressure_height import PressureHeight
 from terrafix.link.mavlink.diagnosis import FIRMWARE_NAMES
 from terrafix.link.mavlink.timesync import TimeSync
-from terrafix.messages import CandidateAttitude, GimbalAttitude, Imu, ImuSample, VehicleState
+from terrafix.messages import CandidateAttitude, Exposure, GimbalAttitude, Imu, ImuSample, VehicleState
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000  # three heartbeats [tuned]
 SENSOR_TIMEOUT_NS = 1_000_000_000  # an older height or airspeed is not published with an attitude [tuned]
@@ -29,7 +31,7 @@ MAX_ATTITUDE_RAD = 4 * math.pi  # larger angles fit no convention: the message i
 MAX_HEIGHT_M = 20_000.0  # larger heights are ignored [tuned]
 # Length of a batch of readings: at 33 Hz one or two readings per message. It is shorter than the processing time of an
 # image in vision, so that the estimate of a frame does not wait for readings. [tuned]
-IMU_BATCH_NS = 40_000_000
+LIVE_IMU_BATCH_NS = 40_000_000
 
 
 class TelemetryDecoder:
@@ -93,6 +95,15 @@ class TelemetryDecoder:
         if by_autopilot and kind in ATTITUDE_MESSAGES and kind != "MOUNT_STATUS":
             t_ns = self.measured_ns(message.time_boot_ms * NS_PER_MS, now_ns)
         return self._gimbal.take(message, t_ns)
+
+    def on_exposure(self, message: Any, now_ns: int) -> Exposure | None:
+        """A message of the autopilot; None: it reports no exposure."""
+        read = exposure_of(message)
+        if read is None:
+            return None
+        kind, number, since_boot_ns = read
+        t_ns = now_ns if since_boot_ns is None else self.measured_ns(since_boot_ns, now_ns)
+        return Exposure(t_ns=t_ns, kind=kind, number=number)
 
     def restore(self, checkpoint: LinkCheckpoint, now_ns: int) -> None:
         """Restores the state from the checkpoint of the previous link process, as if a heartbeat had arrived now."""
@@ -165,7 +176,7 @@ class TelemetryDecoder:
         if self._imu_batch and t_ns <= self._imu_batch[-1][0]:
             return None  # repeated, or the mapping of the clocks has just moved
         self._imu_batch.append((t_ns, readings))
-        if t_ns - self._imu_batch[0][0] < IMU_BATCH_NS:
+        if t_ns - self._imu_batch[0][0] < LIVE_IMU_BATCH_NS:
             return None
         samples: list[ImuSample] = [(t_ns - at_ns, *values) for at_ns, values in self._imu_batch]  # type: ignore[misc]
         self._imu_batch.clear()

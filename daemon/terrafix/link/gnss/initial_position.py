@@ -12,21 +12,30 @@ from dataclasses import dataclass
 
 from terrafix.link.gnss.spoofing_detector import (
     DEFAULT_RECEIVER_SIGMA_M,
-    FIX_3D,
-    JUMP_GATE_SIGMAS,
+    GNSS_JUMP_SIGMAS,
     MIN_RECEIVER_SIGMA_M,
     READING_TIMEOUT_NS,
 )
 from terrafix.link.ground_station.prior_request import UNKNOWN_POSITION_SIGMA_M
 from terrafix.link.integrity.output_predictor import distance_m
 from terrafix.link.pilot_text.statustext import INFO, WARNING, statustext
-from terrafix.messages import GnssInitialPosition, GnssReading, InitialPosition, Message, Origin, StatusText, Verdict
+from terrafix.messages import (
+    FIX_3D,
+    GnssInitialPosition,
+    GnssReading,
+    InitialPosition,
+    Message,
+    Origin,
+    StatusText,
+    Verdict,
+)
 
 MAX_CLAIMED_SIGMA_M = 10.0  # m, 1-sigma; twice what ArduPilot requires before a copter is armed [tuned]
 STATIONARY_NS = 5_000_000_000  # ns at one position before it is used [tuned]
 # m/s; slower than a walking person, faster than the reported speed of a receiver at rest. [tuned]
 MAX_STATIONARY_SPEED_MPS = 0.5
-MOVED_SIGMAS, MOVED_READINGS = 2.0, 3  # distance in claimed sigmas, readings in a row: the receiver has moved [tuned]
+# distance in claimed sigmas, readings in a row: the receiver has moved [tuned]
+START_MOVED_SIGMAS, MOVED_READINGS = 2.0, 3
 SIGMA_IMPROVEMENT = 0.5  # share of the published sigma; a receiver improves after its start [tuned]
 MAX_TRANSPORT_SPEED_MPS = 40.0  # m/s; transport by car [tuned]
 PUBLISH_PERIOD_NS = 1_000_000_000  # ns between repetitions of the message [tuned]
@@ -78,12 +87,12 @@ class _ReceiverTrack:
         self.newest = here
         if before is not None:
             dt_ns = here.t_ns - before.t_ns
-            if here.differs_from(before, JUMP_GATE_SIGMAS, MAX_TRANSPORT_SPEED_MPS * dt_ns * 1e-9):
+            if here.differs_from(before, GNSS_JUMP_SIGMAS, MAX_TRANSPORT_SPEED_MPS * dt_ns * 1e-9):
                 self.jump_m = here.distance_m(before)
             if dt_ns > READING_TIMEOUT_NS:
                 self._stationary_since = None
         moving = reading.speed_mps is not None and reading.speed_mps > MAX_STATIONARY_SPEED_MPS
-        if self._stationary_since is None or moving or here.differs_from(self._stationary_since, MOVED_SIGMAS):
+        if self._stationary_since is None or moving or here.differs_from(self._stationary_since, START_MOVED_SIGMAS):
             self._stationary_since = here
 
     def stationary_fix(self, now_ns: int) -> _Fix | None:
@@ -152,7 +161,7 @@ class GnssInitializer:
             )
             return
         fixes = {n: fix for n, r in self._tracks.items() if (fix := r.stationary_fix(now_ns)) is not None}
-        if any(a.differs_from(b, JUMP_GATE_SIGMAS) for a in fixes.values() for b in fixes.values()):
+        if any(a.differs_from(b, GNSS_JUMP_SIGMAS) for a in fixes.values() for b in fixes.values()):
             self._distrusted = True
             yield from self._withdraw(now_ns, number, "GPS 1 and GPS 2 disagree: no start")
             return
@@ -166,14 +175,14 @@ class GnssInitializer:
         if self._initial is None:
             return True
         initial = self._initial[1]
-        return fix.differs_from(initial, MOVED_SIGMAS) or fix.sigma_m < SIGMA_IMPROVEMENT * initial.sigma_m
+        return fix.differs_from(initial, START_MOVED_SIGMAS) or fix.sigma_m < SIGMA_IMPROVEMENT * initial.sigma_m
 
     def _has_moved(self, number: int) -> bool:
         """Whether receiver ``number`` gave the initial position and is elsewhere now."""
         if self._initial is None or self._initial[0] != number:
             return False
         newest = self._tracks[number].newest
-        moved = newest is not None and newest.differs_from(self._initial[1], MOVED_SIGMAS)
+        moved = newest is not None and newest.differs_from(self._initial[1], START_MOVED_SIGMAS)
         self._moved_readings = self._moved_readings + 1 if moved else 0
         return self._moved_readings >= MOVED_READINGS
 

@@ -22,11 +22,7 @@ import numpy as np
 
 from terrafix.core.clock import NS_PER_S
 from terrafix.core.gate import GATE
-from terrafix.link.gnss.spoofing_detector import (
-    DEFAULT_RECEIVER_SIGMA_M,
-    MIN_RECEIVER_SIGMA_M,
-    READING_DELAY_SIGMA_S,
-)
+from terrafix.link.gnss.spoofing_detector import DEFAULT_RECEIVER_SIGMA_M, MIN_RECEIVER_SIGMA_M, READING_DELAY_SIGMA_S
 from terrafix.link.integrity.output_predictor import EE, NN, PredictedState, east_north_m, offset
 from terrafix.messages import GnssReading, MapOffset, NavEstimate
 

@@ -18,6 +18,7 @@ from terrafix.link.integrity.fix_type import SILENCE_AFTER_NS
 from terrafix.link.integrity.output_predictor import InertialBuffer, PredictedState, distance_m, predict_to
 from terrafix.link.pilot_text.statustext import CRITICAL, INFO, NOTICE, WARNING, statustext
 from terrafix.messages import (
+    EkfStatus,
     GnssReading,
     GnssState,
     GnssVerdict,
@@ -28,11 +29,14 @@ from terrafix.messages import (
     VehicleState,
 )
 
-VERDICT_PERIOD_NS = NS_PER_S  # ns; a verdict is published on every change, and in this period [tuned]
+GNSS_VERDICT_PERIOD_NS = NS_PER_S  # ns; a verdict is published on every change, and in this period [tuned]
 # ns for which a step of our own estimate counts as a possible cause of a disagreement. [tuned]
 OWN_STEP_MEMORY_NS = 10 * NS_PER_S
 MIN_FIX_DURATION_NS = 2 * NS_PER_S  # ns with a 3D fix of ours before the autopilot is switched to it [tuned]
 MIN_VISION_NS = 30 * NS_PER_S  # ns on our position before a switch back [tuned]
+# m from the autopilot's own position to ours; over a larger step it is not switched [spec: ON-6 of the requirements]
+MAX_SWITCH_STEP_M = 200.0
+EKF_POSITION_TIMEOUT_NS = 3 * NS_PER_S  # its position comes with its status, at 1 Hz [spec: link/mavlink/message_rates]
 MIN_GNSS_NS = 5 * NS_PER_S  # ns on the receiver before a further switch; short, for repeated spoofing [tuned]
 # ns without a 3D fix of ours for which the autopilot must not use a spoofed receiver. Its EKF rejects that position for
 # 7 s and is then reset to it; a gap shorter than the first one costs no parameter. [measured: docs/autopilot-facts.md]
@@ -63,6 +67,8 @@ class GnssMonitor:
         self._on_vision = on_vision
         self._fallback = True  # the autopilot may use its receiver while we send no fix
         self._switched_ns: int | None = None
+        self._ekf_status: EkfStatus | None = None
+        self._refused = False  # a switch to our position, since the pilot was told
 
     def on_estimate(self, estimate: NavEstimate, inertial: InertialBuffer) -> None:
         if self._estimate is not None:
@@ -73,6 +79,9 @@ class GnssMonitor:
 
     def on_vehicle_state(self, state: VehicleState) -> None:
         self._armed = state.armed
+
+    def on_ekf_status(self, status: EkfStatus) -> None:
+        self._ekf_status = status
 
     def on_reading(self, reading: GnssReading, inertial: InertialBuffer) -> Iterator[Message]:
         if self._mode == "off":
@@ -118,9 +127,9 @@ class GnssMonitor:
         return None if uncertain or predicted.age_s > MAX_VISION_AGE_S else predicted
 
     def _publish(self, receiver: int, assessment: Assessment, now_ns: int) -> Iterator[Message]:
-        before, published_ns = self._published.get(receiver, (GnssState.UNKNOWN, -VERDICT_PERIOD_NS))
+        before, published_ns = self._published.get(receiver, (GnssState.UNKNOWN, -GNSS_VERDICT_PERIOD_NS))
         changed = assessment.state is not before
-        if not changed and now_ns - published_ns < VERDICT_PERIOD_NS:
+        if not changed and now_ns - published_ns < GNSS_VERDICT_PERIOD_NS:
             return
         self._published[receiver] = (assessment.state, now_ns)
         yield GnssVerdict(
@@ -157,15 +166,35 @@ class GnssMonitor:
         return None
 
     def _switch(self, now_ns: int) -> Iterator[Message]:
-        """To our position when no receiver is usable; back when one is trusted."""
+        """To our position when no receiver is usable, by a step of MAX_SWITCH_STEP_M at most; back when one is
+        trusted."""
         wait_ns = MIN_VISION_NS if self._on_vision else MIN_GNSS_NS
         if self._armed is False or (self._switched_ns is not None and now_ns - self._switched_ns < wait_ns):
             return
         states = [detector.assessment.state for detector in self._detectors.values()]
         if not self._on_vision and self._own_fix(now_ns) and all(state in UNUSABLE_STATES for state in states):
-            yield from self._select(now_ns, vision=True)
+            yield from self._promote(now_ns)
         elif self._on_vision and any(state is GnssState.TRUSTED for state in states):
             yield from self._select(now_ns, vision=False)
+
+    def _promote(self, now_ns: int) -> Iterator[Message]:
+        step_m = self._step_m(now_ns)
+        if step_m <= MAX_SWITCH_STEP_M:
+            self._refused = False
+            yield from self._select(now_ns, vision=True)
+        elif not self._refused:
+            self._refused = True
+            yield statustext(now_ns, CRITICAL, f"not switched: the map is {step_m:.0f} m off")
+
+    def _step_m(self, now_ns: int) -> float:
+        """From where the autopilot takes itself to be to our position: by its own report, else by the receivers, all of
+        which are unusable. Without any position it has none to step from: 0."""
+        status = self._ekf_status
+        if status is None or status.lat_deg is None or now_ns - status.t_ns > EKF_POSITION_TIMEOUT_NS:
+            return max((d.assessment.distance_m or 0.0 for d in self._detectors.values()), default=0.0)
+        assert self._estimate is not None and status.lon_deg is not None  # we have a fix
+        ours = predict_to(self._estimate, status.t_ns, InertialBuffer())
+        return distance_m(ours.lat_deg, ours.lon_deg, status.lat_deg, status.lon_deg)
 
     def _lock_out(self, now_ns: int) -> Iterator[Message]:
         """While we are without a fix and a receiver is spoofed, the autopilot must not fall back to it."""

@@ -26,8 +26,8 @@ MEAN_MEMORY_S = 600.0  # s; memory of the mean offset [tuned]
 STATISTICS_MEMORY_S = 1800.0  # s; memory of the error statistics [tuned]
 DECORRELATION_S = 15.0  # s; errors that are so far apart count as one independent sample each [tuned]
 # Ridge term of the regression, in samples: keeps the coefficient near zero (prediction: the mean) at first. [tuned]
-RIDGE = 10.0
-MAX_SIGMA_RATIO = 1.3  # claimed sigma of a past offset over the present one, above which it is not used [tuned]
+OFFSET_RIDGE = 10.0
+MAX_OFFSET_SIGMA_RATIO = 1.3  # claimed sigma of a past offset over the present one, above which it is not used [tuned]
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,13 @@ class OffsetPredictor:
 
     def _reference_offset(self, variance_m2: float) -> complex:
         """The offset HORIZON_S ago; the mean when there is none, or none that is accurate enough."""
-        if not self._covers_horizon() or self._pending[0].variance_m2 > MAX_SIGMA_RATIO**2 * variance_m2:
+        if not self._covers_horizon() or self._pending[0].variance_m2 > MAX_OFFSET_SIGMA_RATIO**2 * variance_m2:
             return self._mean_m
         return self._pending[0].offset_m
 
     def _coefficient(self) -> float:
         """Coefficient of the autoregression, 0 to 1."""
-        return min(1.0, max(0.0, self._xy / (self._xx + RIDGE)))
+        return min(1.0, max(0.0, self._xy / (self._xx + OFFSET_RIDGE)))
 
     def _learn(self, sample: _PendingSample) -> None:
         gain, keep = SAMPLE_S / DECORRELATION_S, 1.0 - SAMPLE_S / STATISTICS_MEMORY_S

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 from terrafix.link.gnss.offset_predictor import HORIZON_S, OffsetPredictor
 from terrafix.link.integrity.output_predictor import PredictedState, east_north_m
-from terrafix.messages import GnssReading, GnssState
+from terrafix.messages import FIX_3D, GnssReading, GnssState
 
-FIX_3D = 3  # [spec: MAVLink GPS_FIX_TYPE]
 READING_TIMEOUT_NS = 1_500_000_000  # ns; readings arrive five times a second [tuned]
 MAX_RECEIVER_SIGMA_M = 25.0  # m, claimed by the receiver; jamming raises it before the fix is lost [tuned]
 # m, 1-sigma. Receivers claim less under open sky, without their slowly varying error (u-blox M8: 2.5 m CEP). [tuned]
@@ -26,13 +25,13 @@ DEFAULT_RECEIVER_SIGMA_M = 5.0  # m, 1-sigma of a receiver without a claim [tune
 READING_DELAY_S, READING_DELAY_SIGMA_S = 0.15, 0.1  # s; age on arrival: receiver, autopilot, stream [tuned]
 MAX_VISION_AGE_S = 2.0  # s; an older estimate is not compared [tuned]
 MAX_VISION_SIGMA_M = 50.0  # m; an estimate with a larger 1-sigma is not compared [tuned]
-JUMP_GATE_SIGMAS, JUMP_READINGS = 5.5, 3  # chosen in 5000 h with 5 alarms [measured: docs/autopilot.md]
+GNSS_JUMP_SIGMAS, JUMP_READINGS = 5.5, 3  # chosen in 5000 h with 5 alarms [measured: docs/autopilot.md]
 # Drag-off test: p-value below which a reading counts, and how long that must last (the fifth reading at 5 Hz). One
 # false alarm in 100 h is allowed; measured was one in 770 h. [measured: docs/autopilot.md]
 DRAG_P_VALUE = 2e-4
 DRAG_MIN_S, DRAG_MIN_READINGS = 0.8, 3  # s, readings in a row [measured: docs/autopilot.md]
 MAX_READING_INTERVAL_S = 1.0  # s; a reading counts for the time since the last one, up to this [tuned]
-AGREEMENT_SIGMAS, AGREEMENT_P_VALUE = 3.0, 1e-3  # within these a reading agrees with the estimate [tuned]
+GNSS_AGREEMENT_SIGMAS, AGREEMENT_P_VALUE = 3.0, 1e-3  # within these a reading agrees with the estimate [tuned]
 AGREEMENT_MAX_SIGMA_M = 20.0  # m, 1-sigma of the distance; with a larger one agreement has no weight [tuned]
 # s of agreement without a break before a receiver is trusted. [tuned]
 TRUST_AFTER_START_S, TRUST_AFTER_LOSS_S, TRUST_AFTER_SPOOFING_S = 10.0, 30.0, 60.0
@@ -128,9 +127,9 @@ class SpoofingDetector:
         if own_step and p_value < AGREEMENT_P_VALUE:
             self._predictor, p_value = OffsetPredictor(), 1.0  # our estimate moved: the statistics restart
         distance_m = abs(offset.offset_m)
-        self._jump_run.update(offset.sigmas > JUMP_GATE_SIGMAS, dt_s)
+        self._jump_run.update(offset.sigmas > GNSS_JUMP_SIGMAS, dt_s)
         self._drag_run.update(p_value < DRAG_P_VALUE, dt_s)
-        if offset.sigmas >= AGREEMENT_SIGMAS or p_value < AGREEMENT_P_VALUE:
+        if offset.sigmas >= GNSS_AGREEMENT_SIGMAS or p_value < AGREEMENT_P_VALUE:
             self._agreement_s = 0.0
         elif offset.sigma_m < AGREEMENT_MAX_SIGMA_M:
             self._agreement_s += dt_s

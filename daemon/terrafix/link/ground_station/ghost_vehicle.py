@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.link.ground_station.position_prior import COMMAND_TYPES, command_ack
 from terrafix.messages import GpsInput
 
-PERIOD_NS = 500_000_000  # ns between positions; enough for a map on a screen [tuned]
+GHOST_PERIOD_NS = 500_000_000  # ns between positions; enough for a map on a screen [tuned]
 MIN_COURSE_SPEED_MPS = 1.0  # m/s; below it the course over ground is not defined [tuned]
 HEADING_UNKNOWN = 65535  # [spec: MAVLink GLOBAL_POSITION_INT hdg]
 UNKNOWN_U16 = 65535  # [spec: MAVLink GPS_RAW_INT vel, cog]
@@ -38,7 +38,7 @@ class GhostVehicle:
         and the mark on the map stays at its last position."""
         if gps.t_ns < self._next_ns:
             return
-        self._next_ns = gps.t_ns + PERIOD_NS
+        self._next_ns = gps.t_ns + GHOST_PERIOD_NS
         has_fix = gps.fix_type >= 3
         lat_lon_alt = (round(gps.lat_deg * 1e7), round(gps.lon_deg * 1e7), round(gps.alt_amsl_m * 1e3))
         speed_mps = math.hypot(gps.vn_mps, gps.ve_mps)

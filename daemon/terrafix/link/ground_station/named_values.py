@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.messages import GpsInput
 
-PERIOD_NS = 1_000_000_000  # ns between values [tuned]
+VALUE_PERIOD_NS = 1_000_000_000  # ns between values [tuned]
 
 
 class NamedValues:
@@ -20,7 +20,7 @@ class NamedValues:
         """Names have 10 characters at most (MAVLink). A value that is not known is NaN."""
         waiting = self._next_ns is None or gps.t_ns < self._next_ns
         if self._next_ns is None or not waiting:
-            self._next_ns = gps.t_ns + PERIOD_NS
+            self._next_ns = gps.t_ns + VALUE_PERIOD_NS
         if waiting:
             return
         has_fix = gps.fix_type >= 3

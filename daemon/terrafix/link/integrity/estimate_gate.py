@@ -13,12 +13,13 @@ from terrafix.messages import NavEstimate, Verdict
 # Jitter of clock readings between two processes. An estimate further in the future is a bug of its sender. [tuned]
 MAX_FUTURE_NS = 50_000_000
 MAX_DELAY_NS = 5_000_000_000  # on arrival, ns; too old to be predicted to the present by any means [tuned]
-MAX_SPEED_MPS = 100.0  # ground speed; above that of all vehicles that this is made for [tuned]
+MAX_ESTIMATE_SPEED_MPS = 100.0  # ground speed; above that of all vehicles that this is made for [tuned]
 MAX_CLIMB_MPS = 30.0  # m/s, climb or descent; same reason [tuned]
 MIN_AMSL_M, MAX_AMSL_M = -500.0, 10_000.0  # shore of the Dead Sea; above the ceiling of small vehicles [tuned]
 MAX_ABOVE_GROUND_M = 5_000.0  # m above the ground at the origin [tuned]
 MAX_BELOW_GROUND_M = 300.0  # m below the ground at the origin: terrain may descend from there [tuned]
-JUMP_GATE_SIGMAS = 5.0  # as the autopilot's own position gate [spec: ArduPilot EK3_POS_I_GATE 500, hundredths of sigma]
+# as the autopilot's own position gate [spec: ArduPilot EK3_POS_I_GATE 500, hundredths of sigma]
+ESTIMATE_JUMP_SIGMAS = 5.0
 JUMP_GATE_MIN_M = 10.0  # m; the autopilot's EKF averages smaller steps [tuned]
 LARGE_JUMP_M = 200.0  # m; a larger jump needs confirmation whatever accuracy is claimed (ON-6) [tuned]
 
@@ -104,7 +105,7 @@ def _jump_and_gate(old: NavEstimate, new: NavEstimate, inertial: InertialBuffer)
     """-> (distance of ``new`` from ``old`` predicted to the time of ``new`` [m]; gate for it from both claims [m])."""
     predicted, fresh = predict_to(old, new.t_ns, inertial), predict_to(new, new.t_ns, inertial)
     jump_m = distance_m(predicted.lat_deg, predicted.lon_deg, new.lat_deg, new.lon_deg)
-    gate_m = JUMP_GATE_SIGMAS * math.hypot(predicted.horizontal_sigma_m, fresh.horizontal_sigma_m)
+    gate_m = ESTIMATE_JUMP_SIGMAS * math.hypot(predicted.horizontal_sigma_m, fresh.horizontal_sigma_m)
     return jump_m, max(JUMP_GATE_MIN_M, gate_m)
 
 
@@ -125,7 +126,7 @@ def _why_implausible(estimate: NavEstimate, ground_amsl_m: float | None) -> str:
         return f"latitude {estimate.lat_deg}, longitude {estimate.lon_deg} is nowhere"
     if min(estimate.cov[EE], estimate.cov[NN], estimate.cov[UU]) <= 0.0 or estimate.velocity_sigma_mps < 0.0:
         return "claims a variance that is not positive"
-    if math.hypot(ve, vn) > MAX_SPEED_MPS or abs(vu) > MAX_CLIMB_MPS:
+    if math.hypot(ve, vn) > MAX_ESTIMATE_SPEED_MPS or abs(vu) > MAX_CLIMB_MPS:
         return f"speed {math.hypot(ve, vn):.0f} m/s, climb {vu:.0f} m/s"
     if not MIN_AMSL_M <= estimate.alt_amsl_m <= MAX_AMSL_M:
         return f"height {estimate.alt_amsl_m:.0f} m AMSL"

@@ -12,12 +12,10 @@ from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.link.integrity.output_predictor import PredictedState
 from terrafix.messages import SourceLabel
 
-FIX_3D, NO_FIX = 3, 1  # GPS_FIX_TYPE of GPS_INPUT [spec: MAVLink GPS_INPUT]
-
 # Age of the estimate up to which the link predicts it, ns. Beyond it the autopilot's own inertial dead reckoning is
 # better (0.2 to 0.5 m after 3 s of silence, measured on the firmware) than constant velocity, and silence of up to 4 s
 # has no effect on the autopilot. [tuned]
-MAX_AGE_NS = 2_000_000_000
+MAX_PREDICTION_AGE_NS = 2_000_000_000
 SILENCE_AFTER_NS = 35_000_000_000  # ns; last degradation level, by then every vehicle has rejected this GPS [tuned]
 MAX_HORIZONTAL_SIGMA_M = 50.0  # m; the autopilot's gate is 7 times this, above it any position would pass [tuned]
 RECOVERY_HORIZONTAL_SIGMA_M = 40.0  # m; hysteresis: narrower limit for the return to fix type 3 [tuned]
@@ -106,7 +104,7 @@ class FixGate:
     def _no_fix_reason(
         self, predicted: PredictedState, accuracy_m: float, level: int, label: SourceLabel
     ) -> NoFixReason | None:
-        if predicted.age_s * 1e9 > (MAX_AGE_NS if self.has_fix or self._sent is None else RECOVERY_AGE_NS):
+        if predicted.age_s * 1e9 > (MAX_PREDICTION_AGE_NS if self.has_fix or self._sent is None else RECOVERY_AGE_NS):
             return NoFixReason(f"estimate is {predicted.age_s:.1f} s old", "the estimate is too old")
         if label is SourceLabel.NOT_PLACED:
             return NOT_PLACED

@@ -15,7 +15,7 @@ from terrafix.messages import Imu, VehicleState
 BUFFER_NS = 4_000_000_000  # ns of readings; longer than any prediction (fix_type.MAX_AGE_NS) [tuned]
 # Largest interval between readings, and from the last one to the end of the increment, ns: a serial line may have room
 # for 10 Hz only. [tuned]
-MAX_GAP_NS = 150_000_000
+MAX_IMU_GAP_NS = 150_000_000
 # Largest age of the attitude at a reading, ns. One period of ATTITUDE at ArduPilot's default of 4 Hz is still accepted;
 # over longer intervals a vehicle turns too far. [tuned]
 MAX_ATTITUDE_AGE_NS = 260_000_000
@@ -56,9 +56,9 @@ class InertialIntegrator:
     def delta(self, t0_ns: int, t1_ns: int) -> tuple[Vec3, Vec3] | None:
         """-> (velocity increment [m/s], position increment that it causes [m]) from ``t0_ns`` to ``t1_ns``, in east,
         north, up by the compass; None when the readings do not cover the interval."""
-        inside = [a for a in self._accel if t0_ns - MAX_GAP_NS <= a[0] <= t1_ns + MAX_GAP_NS]
+        inside = [a for a in self._accel if t0_ns - MAX_IMU_GAP_NS <= a[0] <= t1_ns + MAX_IMU_GAP_NS]
         times = [a[0] for a in inside]
-        if not covers(times, t0_ns, t1_ns, MAX_GAP_NS):
+        if not covers(times, t0_ns, t1_ns, MAX_IMU_GAP_NS):
             return None
         delta_v, delta_p = integrate_held(times, [a[1:] for a in inside], t0_ns, t1_ns)
         return _vec3(delta_v), _vec3(delta_p)

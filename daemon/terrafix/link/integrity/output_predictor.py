@@ -15,14 +15,14 @@ from terrafix.link.integrity.inertial_integrator import BUFFER_NS, MAX_ATTITUDE_
 from terrafix.messages import Imu, NavEstimate, VehicleState
 
 # Indices of the position block in NavEstimate.cov, and of the rotation about up. [spec: row-major 6x6 covariance]
-EE, EN, NN, UU, HEADING = 0, 1, 7, 14, 35
+EE, EN, NN, UU, HEADING_VARIANCE = 0, 1, 7, 14, 35
 WGS84_A_M = 6_378_137.0  # m, semi-major axis [spec: NIMA TR8350.2]
 WGS84_E2 = 6.694379990141e-3  # first eccentricity squared [spec: NIMA TR8350.2]
 # 1-sigma of the acceleration that the prediction leaves out, m/s^2, by what is known of the interval.
 # With IMU readings: an attitude error of 2 degrees projects so much gravity into the horizontal. The result was
 # compared with the truth of ArduPilot's firmware. [measured: docs/link.md]
 ACCEL_SIGMA_IMU_MPS2 = 0.4
-HEADING_SIGMA_RAD = math.radians(5.0)  # rad; heading error, rotates the inertial increments; at least [tuned]
+OUTPUT_HEADING_SIGMA_RAD = math.radians(5.0)  # rad; heading error, rotates the inertial increments; at least [tuned]
 # With attitude alone a banked turn is known: what is left is gusts and speed changes of a plane. [tuned]
 ACCEL_SIGMA_ATTITUDE_MPS2 = 0.5
 # Share of the acceleration of a lean that is 1-sigma where the lean may, or may not, be a manoeuvre: a copter that
@@ -128,7 +128,7 @@ def predict_to(estimate: NavEstimate, now_ns: int, inertial: InertialBuffer) -> 
     if increments is not None:
         delta_v, delta_p = increments
         accel_sigma = ACCEL_SIGMA_IMU_MPS2
-        heading_sigma_rad = max(HEADING_SIGMA_RAD, math.sqrt(max(0.0, estimate.cov[HEADING])))
+        heading_sigma_rad = max(OUTPUT_HEADING_SIGMA_RAD, math.sqrt(max(0.0, estimate.cov[HEADING_VARIANCE])))
         heading_error_mps, heading_error_m = (heading_sigma_rad * math.hypot(v[0], v[1]) for v in increments)
     else:
         turn = inertial.lateral_accel(estimate.t_ns, now_ns, math.hypot(ve, vn))

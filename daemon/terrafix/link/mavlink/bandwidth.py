@@ -5,9 +5,10 @@ streams that others requested, and replies. docs/link.md lists the resulting rat
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.link.mavlink.framing import SIGNATURE_BYTES
+
 BITS_PER_BYTE = 10  # 8N1: start bit, eight data bits, stop bit [spec: UART]
 FRAME_BYTES = 12  # header (10) and checksum (2) of a packet [spec: MAVLink 2 serialization guide]
-SIGNATURE_BYTES = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN
 # Share of the bandwidth for planned messages; inbound the autopilot also sends what others requested. [tuned]
 USABLE_SHARE_IN, USABLE_SHARE_OUT = 0.7, 0.9
 SATURATED_SHARE = 0.95  # share of the bandwidth above which one second of traffic counts as full [tuned]

@@ -10,9 +10,15 @@ from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
 from terrafix.link.mavlink.framing import Framer
 from terrafix.link.mavlink.signing import Signing, read_key
-from terrafix.link.mavlink.transport import MAX_PEERS, Address, Transport, UdpIn, UdpOut, open_transport
-
-REOPEN_PERIOD_NS = 1_000_000_000  # between two attempts to open a lost device [tuned]
+from terrafix.link.mavlink.transport import (
+    MAX_PEERS,
+    REOPEN_PERIOD_NS,
+    Address,
+    Transport,
+    UdpIn,
+    UdpOut,
+    open_transport,
+)
 
 
 class Connection:
@@ -20,12 +26,7 @@ class Connection:
     reopen."""
 
     def __init__(
-        self,
-        config: LinkSection,
-        transport: Transport | None,
-        wall_clock_ns: Callable[[], int],
-        *,
-        link_id: int = 0,
+        self, config: LinkSection, transport: Transport | None, wall_clock_ns: Callable[[], int], *, link_id: int = 0
     ) -> None:
         """``transport`` None: ``messages`` opens it. ``link_id``: link id of the signatures, one for each connection.
 

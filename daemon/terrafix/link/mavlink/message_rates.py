@@ -50,10 +50,7 @@ PX4_UNAVAILABLE = {mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE}  # not tested on PX4
 OPTIONAL_ON_PX4 = OPTIONAL | {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT}
 PX4_EXTRA_HZ = {mavlink.MAVLINK_MSG_ID_ALTITUDE: 5.0}  # Hz, on PX4 only [tuned]
 # Requests of a message that was never received: ArduPilot before 4.6 rejects each with a text to the pilot. [tuned]
-MAX_UNANSWERED_REQUESTS = {
-    mavlink.MAVLINK_MSG_ID_AIRSPEED: 2,
-    mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 2,
-}
+MAX_UNANSWERED_REQUESTS = {mavlink.MAVLINK_MSG_ID_AIRSPEED: 2, mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 2}
 DATA_STREAM_GROUPS = {  # message -> group of REQUEST_DATA_STREAM that contains it (ArduPilot's SRn_ parameters)
     mavlink.MAVLINK_MSG_ID_ATTITUDE: mavlink.MAV_DATA_STREAM_EXTRA1,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: mavlink.MAV_DATA_STREAM_RAW_SENSORS,
@@ -121,13 +118,7 @@ class Streams:
             self._requested_ns[message_id] = now_ns
             self._request_counts[message_id] = self._request_counts.get(message_id, 0) + 1
             yield mavlink.MAVLink_command_long_message(
-                sysid,
-                compid,
-                mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
-                0,
-                float(message_id),
-                1e6 / rate_hz,
-                *(0.0,) * 5,
+                sysid, compid, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, float(message_id), 1e6 / rate_hz, *(0.0,) * 5
             )
             no_effect = self._request_counts[message_id] > MAX_INTERVAL_REQUESTS and message_id not in self._optional
             if (self._use_data_streams or no_effect) and message_id in DATA_STREAM_GROUPS:

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from terrafix.core.errors import ConfigError
 from terrafix.link.mavlink.framing import SIGNATURE_BYTES, SIGNED_FLAG, V2
 
-KEY_BYTES = 32  # [spec: MAVLink 2 message signing]
+SIGNING_KEY_BYTES = 32  # [spec: MAVLink 2 message signing]
 EPOCH_UNIX_NS = 1_420_070_400 * 1_000_000_000  # 2015-01-01 00:00:00 UTC [spec: MAVLink 2 message signing]
 TIMESTAMP_UNIT_NS = 10_000  # [spec: MAVLink 2 message signing]
 # Timestamp units (10 us): a new stream may be one minute behind our time. [spec: MAVLink 2 message signing]
@@ -32,13 +32,13 @@ def read_key(path: Path) -> bytes:
         raise ConfigError(f"{path}: signing key cannot be read ({error.strerror}); check link.signing_key") from None
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise ConfigError(f"{path}: others may read this signing key; do: chmod 600 {path}")
-    if len(content) == KEY_BYTES:
+    if len(content) == SIGNING_KEY_BYTES:
         return content
     try:
         key = bytes.fromhex(content.decode("ascii"))
     except ValueError:
         key = b""
-    if len(key) != KEY_BYTES:
+    if len(key) != SIGNING_KEY_BYTES:
         raise ConfigError(f"{path}: not a signing key; it must hold 64 hexadecimal digits (32 bytes)")
     return key
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.core.clock import MAX_CLOCK_DRIFT
+
 WINDOW_SAMPLES = 60  # round trips in the fit: one a second for a minute [tuned]
 # A round trip is fast below factor * minimum + margin: then it contains little one-sided delay. [tuned]
 FAST_RTT_FACTOR, FAST_RTT_MARGIN_NS = 1.5, 1_000_000
-MAX_DRIFT = 200e-6  # s/s; crystals are within 50 ppm, a larger fitted drift is noise [tuned]
 MIN_FIT_SPAN_NS = 10_000_000_000  # over a shorter span drift cannot be distinguished from jitter [tuned]
 MAX_RTT_NS = 500_000_000  # slower responses are ignored: their offset is too uncertain [tuned]
 OUTLIER_NS = 20_000_000  # an offset off by more than this plus the round trip time is not jitter [tuned]
@@ -88,5 +89,5 @@ class TimeSync:
         y = np.array([o - base_offset for o in offsets], dtype=np.float64)
         self._drift = 0.0
         if elapsed_ns[-1] - elapsed_ns[0] >= MIN_FIT_SPAN_NS:
-            self._drift = float(np.clip(np.polyfit(elapsed_ns, y, 1)[0], -MAX_DRIFT, MAX_DRIFT))
+            self._drift = float(np.clip(np.polyfit(elapsed_ns, y, 1)[0], -MAX_CLOCK_DRIFT, MAX_CLOCK_DRIFT))
         self._offset_ns = base_offset + float(np.mean(y - self._drift * elapsed_ns))

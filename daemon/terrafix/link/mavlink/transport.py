@@ -16,6 +16,7 @@ import serial
 
 from terrafix.core.errors import LinkError
 
+REOPEN_PERIOD_NS = 1_000_000_000  # between two attempts to open a lost device [tuned]
 CONNECT_TIMEOUT_S = 3.0  # for a TCP peer at start [tuned]
 MAX_READ_BYTES = 65_536  # bytes per read: bounds the share of a tick that a flood of data can take [tuned]
 MAX_DATAGRAMS_PER_READ = 200  # for the same reason [tuned]
@@ -31,13 +32,11 @@ Chunk = tuple[bytes, Address | None]  # with the sender on a listening port; Non
 class Transport(Protocol):
     def read(self) -> list[Chunk]:
         """-> received data in order; empty when there is none."""
-        ...
 
     def write(self, packet: bytes, to: Address | None = None) -> bool:
         """``to``: one peer of a listening port; None: all of its peers, or the only other end.
 
         -> False if the buffer is full or there is no peer. The packet is then lost; it is not sent later."""
-        ...
 
     def close(self) -> None: ...
 

@@ -6,7 +6,7 @@ from terrafix.messages import GpsInput
 
 # An ignored velocity would stay at its last value and be fused for ever. [spec: ArduPilot issue 19633]
 IGNORE_NONE = 0
-YAW_UNKNOWN = 0  # centidegrees; 0 means "not available", north would be 36000 [spec: MAVLink GPS_INPUT yaw]
+GPS_INPUT_YAW_UNKNOWN = 0  # centidegrees; 0 means "not available", north would be 36000 [spec: MAVLink GPS_INPUT yaw]
 
 
 def encode(gps: GpsInput, gps_id: int) -> mavlink.MAVLink_gps_input_message:
@@ -31,5 +31,5 @@ def encode(gps: GpsInput, gps_id: int) -> mavlink.MAVLink_gps_input_message:
         horiz_accuracy=gps.horiz_accuracy_m,
         vert_accuracy=gps.vert_accuracy_m,
         satellites_visible=gps.satellites_visible,
-        yaw=YAW_UNKNOWN,
+        yaw=GPS_INPUT_YAW_UNKNOWN,
     )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from terrafix.link.integrity import fix_type
 from terrafix.link.integrity.output_predictor import PredictedState
-from terrafix.messages import GpsInput
+from terrafix.messages import FIX_3D, NO_FIX, GpsInput
 
 # Small on purpose: 6 satellites pass every check of the autopilot (5 scale its noise up and fail alignment), and a real
 # receiver with a 3D fix has more where the autopilot chooses by their number (GPS_AUTO_SWITCH 1).
@@ -35,7 +35,7 @@ def with_fix(
     ve, vn, vu = predicted.velocity_enu_mps
     return GpsInput(
         t_ns=predicted.t_ns,
-        fix_type=fix_type.FIX_3D,
+        fix_type=FIX_3D,
         time_week=gps_time[0],
         time_week_ms=gps_time[1],
         lat_deg=predicted.lat_deg,
@@ -72,7 +72,7 @@ def no_fix(
     AMSL. ``age_ms``: age of the estimate, -1 without one."""
     return GpsInput(
         t_ns=now_ns,
-        fix_type=fix_type.NO_FIX,
+        fix_type=NO_FIX,
         time_week=gps_time[0],
         time_week_ms=gps_time[1],
         lat_deg=0.0,

@@ -13,7 +13,7 @@ from terrafix.link.output.gps_time import unix_ms
 from terrafix.messages import GpsInput
 
 MSP2_SENSOR_GPS = 0x1F03  # message id [spec: iNav msp_protocol_v2_sensor.h]
-WEEK_UNKNOWN, YAW_UNKNOWN = 0xFFFF, 0xFFFF  # [spec: iNav msp_protocol_v2_sensor_msg.h]
+WEEK_UNKNOWN, MSP_YAW_UNKNOWN = 0xFFFF, 0xFFFF  # [spec: iNav msp_protocol_v2_sensor_msg.h]
 UINT16_MAX = 0xFFFF  # [spec: 16 bits]
 # instance, week, ms of week, fix, satellites, accuracies h, v [cm, iNav: mm], speed [cm/s], hdop * 100, longitude,
 # latitude [1e-7 deg], height AMSL [cm], velocity north, east, down [cm/s], course, yaw [0.01 deg], year, month, day,
@@ -51,7 +51,7 @@ def frame(gps: GpsInput, accuracy_per_m: float = PER_M) -> bytes:
         round(gps.ve_mps * 100),
         round(gps.vd_mps * 100),
         round(math.degrees(math.atan2(gps.ve_mps, gps.vn_mps)) * 100) % 36_000 if has_fix else 0,
-        YAW_UNKNOWN,
+        MSP_YAW_UNKNOWN,
         *((utc.year, utc.month, utc.day, utc.hour, utc.minute, utc.second) if utc else (0,) * 6),
     )
     header = struct.pack("<BHH", 0, MSP2_SENSOR_GPS, len(payload))

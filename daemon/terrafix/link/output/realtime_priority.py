@@ -8,7 +8,7 @@ import os
 
 from terrafix.core import logs
 
-PRIORITY = 1  # lowest priority of SCHED_RR, above all normal processes [spec: sched(7)]
+REALTIME_PRIORITY = 1  # lowest priority of SCHED_RR, above all normal processes [spec: sched(7)]
 THREADS = "/proc/self/task"
 
 
@@ -19,7 +19,7 @@ def set_realtime_priority() -> bool:
     -> False when the system does not allow it (systemd: LimitRTPRIO); a warning is logged."""
     try:
         for thread in os.listdir(THREADS):
-            os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(PRIORITY))
+            os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(REALTIME_PRIORITY))
     except OSError as error:
         remedy = "allow it (systemd: LimitRTPRIO=1); docs/link.md has more"
         logs.get().warning("no real-time priority: GPS_INPUT may be late under load", why=error.strerror, do=remedy)

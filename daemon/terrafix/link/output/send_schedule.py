@@ -3,7 +3,7 @@
 from terrafix.core.clock import NS_PER_S
 
 # ns; the autopilot's EKF drops samples that are closer together. [spec: ArduPilot EKF3 sensorIntervalMin_ms]
-MIN_INTERVAL_NS = 50_000_000
+MIN_SEND_INTERVAL_NS = 50_000_000
 
 
 class SendSchedule:
@@ -20,7 +20,7 @@ class SendSchedule:
             self._deadline_ns = now_ns
         if now_ns < self._deadline_ns - self._early_ns:
             return False
-        if self._last_sent_ns is not None and now_ns - self._last_sent_ns < MIN_INTERVAL_NS:
+        if self._last_sent_ns is not None and now_ns - self._last_sent_ns < MIN_SEND_INTERVAL_NS:
             return False
         # Deadlines that passed without a tick are skipped.
         missed = max(0, now_ns - self._deadline_ns) // self._period_ns

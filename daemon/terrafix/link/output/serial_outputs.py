@@ -4,11 +4,9 @@ from collections.abc import Callable
 
 from terrafix.core.config import LinkSection
 from terrafix.core.errors import LinkError
-from terrafix.link.mavlink.transport import Transport, open_at_start, open_transport
+from terrafix.link.mavlink.transport import REOPEN_PERIOD_NS, Transport, open_at_start, open_transport
 from terrafix.link.output import msp, nmea
 from terrafix.messages import GpsInput
-
-REOPEN_PERIOD_NS = 1_000_000_000  # ns between attempts to open a lost device [tuned]
 
 
 class SerialOutput:

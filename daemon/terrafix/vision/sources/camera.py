@@ -10,11 +10,11 @@ from terrafix.core import logs
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
 from terrafix.core.passwords import without_password
-from terrafix.messages import STAMP_SIGMA_S, Camera, Frame, Origin
+from terrafix.messages import STAMP_SIGMA_S, Camera, Fact, Frame, Origin
 from terrafix.vision.sources.capture import Capture, Stamp, open_device, open_stream
 from terrafix.vision.sources.contract import UNKNOWN_TIMING, Shot, Timing
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
-from terrafix.vision.sources.facts import Fact, camera_facts, mount_fact, start_fact
+from terrafix.vision.sources.facts import camera_facts, mount_fact, start_fact
 from terrafix.vision.sources.gst import GstCapture, gstreamer
 from terrafix.vision.sources.mjpeg import MjpegCapture
 from terrafix.vision.sources.stream_address import DEVICE, HTTP, NETWORK

@@ -37,23 +37,18 @@ class Capture(Protocol):
 
     def grab(self) -> bool:
         """Waits for the next image. False: the camera is lost."""
-        ...
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
         """-> whether the grabbed image could be decoded, and the image (H, W, 3) uint8 BGR."""
-        ...
 
     def stamp(self, arrival_ns: int) -> Stamp:
         """Of the grabbed image, which arrived at ``arrival_ns``."""
-        ...
 
     def size(self) -> tuple[int, int] | None:
         """Width and height; None: unknown before the first image."""
-        ...
 
     def described(self) -> str:
         """By what the camera is read, and why by that."""
-        ...
 
     def release(self) -> None: ...
 

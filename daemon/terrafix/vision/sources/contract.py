@@ -3,10 +3,11 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from terrafix.core.errors import SourceError
 from terrafix.messages import Frame, GimbalAttitude, Imu, Message, Origin, VehicleState
 
 TimedMessage = TypeVar("TimedMessage", VehicleState, Imu, GimbalAttitude)
@@ -73,3 +74,19 @@ class Source(Protocol):
     def name(self) -> str: ...
 
     def close(self) -> None: ...
+
+
+@runtime_checkable
+class WithTruth(Protocol):
+    """A source whose file also has positions, which nothing reads but ``terrafix source truth``."""
+
+    def truth(self) -> list[tuple[str, float, float]]:
+        """(file, latitude, longitude [degrees, WGS 84]) of frames. Raises SourceError: it has no positions."""
+        ...
+
+
+def truth_of(source: Source) -> list[tuple[str, float, float]]:
+    """``WithTruth.truth``. Raises SourceError for a source without any."""
+    if not isinstance(source, WithTruth):
+        raise SourceError(f"{source.name()}: has no positions that could be the truth")
+    return source.truth()

@@ -63,6 +63,8 @@ class CameraTable(_Table, frozen=True, kw_only=True):
     fov_deg: Annotated[float, Meta(gt=0, le=360)] | None = (
         None  # circle that a fisheye images, if smaller than the image
     )
+    # Rolling shutter: from the exposure of the first row to that of the last; negative: the last row is first
+    readout_ms: Annotated[float, Meta(ge=-200, le=200)] = 0.0
 
     @classmethod
     def of(cls, camera: Camera) -> "CameraTable":
@@ -78,6 +80,7 @@ class CameraTable(_Table, frozen=True, kw_only=True):
             focal_sigma=camera.focal_sigma,
             model="fisheye" if isinstance(camera, FisheyeCamera) else "pinhole",
             fov_deg=camera.fov_deg if isinstance(camera, FisheyeCamera) and camera.fov_deg < FULL_FOV_DEG else None,
+            readout_ms=1e3 * (camera.readout_s or 0.0),
         )
 
 
@@ -183,7 +186,7 @@ def camera_of(path: Path, description: Description) -> Camera:
     Raises SourceError: no [camera], or implausible values."""
     if description.camera is None:
         raise SourceError(f"{path}: there is no [camera]; add one with width, height, fx, fy, cx, cy in pixels")
-    c, m = description.camera, description.mount
+    c = description.camera
     circle = FULL_FOV_DEG if c.fov_deg is None else c.fov_deg
     kind = partial(FisheyeCamera, fov_deg=circle) if c.model == "fisheye" else Camera
     camera = kind(
@@ -195,14 +198,23 @@ def camera_of(path: Path, description: Description) -> Camera:
         cy=c.cy,
         distortion=c.distortion,
         focal_sigma=c.focal_sigma or (CALIBRATED_FOCAL_SIGMA if c.distortion else FOCAL_SIGMA),
-        mount_yaw_deg=m.yaw_deg,
-        mount_pitch_deg=m.pitch_deg,
-        mount_roll_deg=m.roll_deg,
-        mount_tolerance_deg=m.tolerance_deg,
-        gimbal=_gimbal(m),
+        readout_s=1e-3 * c.readout_ms or UNSET,
     )
-    check_camera(path, view_of(camera))
-    return camera
+    return with_mount(path, camera, description.mount)
+
+
+def with_mount(path: Path, camera: Camera, mount: MountTable) -> Camera:
+    """``camera`` on ``mount``. Raises SourceError: implausible values of either; ``path``: where they come from."""
+    mounted = msgspec.structs.replace(
+        camera,
+        mount_yaw_deg=mount.yaw_deg,
+        mount_pitch_deg=mount.pitch_deg,
+        mount_roll_deg=mount.roll_deg,
+        mount_tolerance_deg=mount.tolerance_deg,
+        gimbal=_gimbal(mount),
+    )
+    check_camera(path, view_of(mounted))
+    return mounted
 
 
 def _gimbal(mount: MountTable) -> Gimbal | UnsetType:
@@ -246,10 +258,11 @@ def origin_of(
 
 
 def telemetry_log(
-    stem: Path, description: Description, states: Sequence[VehicleState] = ()
+    stem: Path, description: Description, states: Sequence[VehicleState] = (), frames_s: Sequence[float] = ()
 ) -> "TelemetryLog | OwnLog | None":
     """The log beside a flight: ``stem`` with one of LOG_SUFFIXES; None: there is none. Zero and vehicle are those that
-    the description states; ``states``: of the frames, by which the clock of an autopilot's own log is aligned.
+    the description states. The clock of an autopilot's own log is aligned by ``states``, those of the frames, or by
+    their stamps ``frames_s``.
 
     Raises SourceError: it cannot be used, or there are several."""
     found = [stem.with_suffix(suffix) for suffix in LOG_SUFFIXES if stem.with_suffix(suffix).is_file()]
@@ -263,7 +276,7 @@ def telemetry_log(
         return TelemetryLog(found[0], description.telemetry.tlog_t0_us, description.telemetry.system_id)
     from terrafix.core.autopilot_log.own_log import OwnLog
 
-    return OwnLog(found[0], description.telemetry.log_zero_s, states)
+    return OwnLog(found[0], description.telemetry.log_zero_s, states, frames_s)
 
 
 def _check_numbers(path: Path, table: dict[str, Any], where: str = "") -> None:

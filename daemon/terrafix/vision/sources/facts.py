@@ -4,20 +4,16 @@ that its log has, and what is left out and why."""
 import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from terrafix.messages import Camera, Origin, VehicleState
+from terrafix.messages import Camera, Fact, Origin, VehicleState
 
 if TYPE_CHECKING:
     from terrafix.core.autopilot_log.own_log import OwnLog
     from terrafix.core.mavlink.tlog import TelemetryLog
+    from terrafix.vision.sources.rosbag import BagTelemetry
 
 GAP_TIMES = 3.0  # a gap is longer than this many times the median interval
-
-
-class Fact(NamedTuple):
-    topic: str  # "camera", "mount", "start", "height", "heading", "tilt", "clock", "rate", "vehicles", "left out"
-    text: str
 
 
 @runtime_checkable
@@ -86,7 +82,7 @@ def telemetry_facts(states: Sequence[VehicleState], whence: str, origin: Origin)
             yield Fact(topic, f"{count} values from {whence}{sigma}" if count else "not stated")
 
 
-def log_facts(log: "TelemetryLog | OwnLog") -> Iterator[Fact]:
+def log_facts(log: "TelemetryLog | OwnLog | BagTelemetry") -> Iterator[Fact]:
     """Clock, vehicles and damage of a log."""
     yield Fact("clock", f"{log.path.name}: {log.clock}; zero is {log.zero}")
     if len(log.vehicles) == 1:

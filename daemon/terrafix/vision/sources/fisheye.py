@@ -8,9 +8,9 @@ import cv2
 import msgspec
 import numpy as np
 
-from terrafix.messages import Camera, Origin
-from terrafix.vision.sources.contract import Shot, Source
-from terrafix.vision.sources.facts import Fact, facts_of
+from terrafix.messages import Camera, Fact, Origin
+from terrafix.vision.sources.contract import Shot, Source, truth_of
+from terrafix.vision.sources.facts import facts_of
 
 # Off the axis; there a pixel sees three times the ground of one in the middle (1 / cos^2) [spec: geometry]
 VIEW_HALF_DEG = 55.0
@@ -59,6 +59,7 @@ def view_of(camera: Camera) -> Camera:
         mount_roll_deg=camera.mount_roll_deg,
         mount_tolerance_deg=camera.mount_tolerance_deg,
         gimbal=camera.gimbal,
+        readout_s=camera.readout_s,
     )
 
 
@@ -93,6 +94,9 @@ class FisheyeView:
 
     def facts(self) -> list[Fact]:
         return [*facts_of(self._source), *view_facts(self._source.origin().camera)]
+
+    def truth(self) -> list[tuple[str, float, float]]:
+        return truth_of(self._source)
 
     def close(self) -> None:
         self._source.close()

@@ -4,14 +4,15 @@ It may also contain truth.csv, which is not read here."""
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Frame, GimbalAttitude, Imu, Origin, VehicleState
+from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
+from terrafix.vision.sources.exposed import exposed_times
 from terrafix.vision.sources.facts import (
-    Fact,
     camera_facts,
     log_facts,
     mount_fact,
@@ -48,7 +49,12 @@ class FlightFolder:
             stated.sort(key=lambda state: state.t_ns)
             self._stated_in += f" and {table.name}"
         self._stated = stated
-        self._log = telemetry_log(folder / "telemetry", self._description, stated)
+        times_ns = [row.t_ns for row in self._rows]
+        self._log = telemetry_log(folder / "telemetry", self._description, stated, [t_ns * 1e-9 for t_ns in times_ns])
+        self._exposure_facts: list[Fact] = []
+        if self._log is not None and self._log.exposures:
+            times_ns, self._exposure_facts = exposed_times(times_ns, self._log.exposures, self._log.path.name)
+            self._rows = [replace(row, t_ns=t_ns) for row, t_ns in zip(self._rows, times_ns, strict=True)]
         self._states = self._telemetry()
         self._imu: list[Imu] = [] if self._log is None else self._log.imu
         self._gimbal: list[GimbalAttitude] = [] if self._log is None else self._log.gimbal
@@ -77,7 +83,7 @@ class FlightFolder:
             found += telemetry_facts(self._stated, self._stated_in, self._origin)
         if self._log is not None:
             found += telemetry_facts(self._log.states, self._log.path.name, self._origin)
-            found += log_facts(self._log)
+            found += [*log_facts(self._log), *self._exposure_facts]
         outside = sum(not -1e9 <= state.t_ns <= self._rows[-1].t_ns for state in self._states)
         if outside and outside == len(self._states):
             found.append(Fact("left out", "all telemetry: none of it lies within the times of the frames"))

@@ -43,7 +43,7 @@ UDP_BUFFER = 4 << 20  # [spec: four times the largest key frame that a camera of
 REFUSE_DAMAGED = {"wait-for-keyframe": True, "request-keyframe": True, "output-corrupt": False}
 H265_PARSER = "h265parse"  # what it gets is not waited for: GStreamer's depayloader of H.265 has no such property
 NTP_TO_UNIX_S = 2_208_988_800  # [spec: RFC 5905]
-MAX_STAMP_AGE_NS = 10_000_000_000  # an older stamp, or one of the future, is of another clock
+MAX_GST_STAMP_AGE_NS = 10_000_000_000  # an older stamp, or one of the future, is of another clock
 FULL_RANGE = ("1:", "jpeg", "sRGB")  # begin of GStreamer's names of colorimetry with 0 to 255
 _LIMITED = (
     np.clip(np.arange(256) * 219 / 255 + 16, 0, 255),
@@ -148,10 +148,10 @@ class GstCapture:
         return True, cv2.cvtColor(image, cv2.COLOR_YUV2BGR_NV12)[:height, :width]
 
     def stamp(self, arrival_ns: int) -> Stamp:
-        if self._sender_clock and (age_ns := self.sender_age_ns()) is not None and 0 <= age_ns <= MAX_STAMP_AGE_NS:
+        if self._sender_clock and (age_ns := self.sender_age_ns()) is not None and 0 <= age_ns <= MAX_GST_STAMP_AGE_NS:
             return Stamp(arrival_ns - age_ns, False, STAMP_SIGMA_S)
         t_ns = self._running_ns()
-        stamped = self._clocked and t_ns is not None and 0 <= arrival_ns - t_ns <= MAX_STAMP_AGE_NS
+        stamped = self._clocked and t_ns is not None and 0 <= arrival_ns - t_ns <= MAX_GST_STAMP_AGE_NS
         sigma_s = NETWORK_SIGMA_S if self._network else STAMP_SIGMA_S
         return Stamp(t_ns if stamped and t_ns is not None else arrival_ns, self._network or not stamped, sigma_s)
 

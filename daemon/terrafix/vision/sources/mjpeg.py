@@ -21,7 +21,7 @@ MAX_PART_BYTES = 64 << 20  # limit; larger than the images of any camera
 MAX_LINE_BYTES = 8192
 MAX_PIXELS = 50_000_000  # of an image, 150 MB; larger than those of any camera that streams
 JPEG_HEAD = b"\xff\xd8"
-MAX_AGE_NS = 60_000_000_000  # a timestamp that is older, or in the future, belongs to another clock
+MAX_MJPEG_STAMP_AGE_NS = 60_000_000_000  # a timestamp that is older, or in the future, belongs to another clock
 STAMP_HEADER = "x-timestamp-ns"
 
 
@@ -75,7 +75,7 @@ class MjpegCapture:
         size = stated_size(self._jpeg) if self._jpeg.startswith(JPEG_HEAD) else None
         if size is None or size[0] * size[1] > MAX_PIXELS:
             return False, None
-        image = cv2.imdecode(np.frombuffer(self._jpeg, np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(self._jpeg, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         return image is not None, image
 
     def stamp(self, arrival_ns: int) -> Stamp:
@@ -125,4 +125,4 @@ def _valid_stamp(text: str, arrival_ns: int) -> int | None:
     if not text.strip().isdecimal():
         return None
     stamp_ns = int(text.strip())
-    return stamp_ns if 0 <= arrival_ns - stamp_ns <= MAX_AGE_NS else None
+    return stamp_ns if 0 <= arrival_ns - stamp_ns <= MAX_MJPEG_STAMP_AGE_NS else None

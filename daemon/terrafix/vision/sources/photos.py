@@ -11,12 +11,14 @@ from datetime import datetime, timedelta
 from itertools import groupby
 from pathlib import Path
 
+import msgspec
+
 from terrafix.core.errors import SourceError
-from terrafix.messages import Camera, Frame, Origin, VehicleState
+from terrafix.messages import Camera, Fact, Frame, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot
 from terrafix.vision.sources.description import Description, StartTable, camera_of, origin_of, read_description
 from terrafix.vision.sources.exif import PhotoInfo, read_info
-from terrafix.vision.sources.facts import Fact, camera_facts, mount_fact, rate_facts, start_fact, telemetry_facts
+from terrafix.vision.sources.facts import camera_facts, mount_fact, rate_facts, start_fact, telemetry_facts
 from terrafix.vision.sources.images import downscaled_camera, image_files, is_image_name, read_image
 from terrafix.vision.sources.plausible import check_camera, check_heights
 from terrafix.vision.sources.xmp import PIX4D, BodyAngles, Xmp
@@ -27,6 +29,9 @@ from terrafix.vision.sources.xmp import PIX4D, BodyAngles, Xmp
 STATED_TILT_SIGMA_DEG = 9.0
 EXIF_FOCAL_SIGMA = 0.03  # the focal length in EXIF is rounded, or a 35 mm equivalent, and ignores distortion
 UNKNOWN_TOLERANCE_DEG = 10.0  # the mount angle of the camera is unknown
+# Some cameras state a yaw of their gimbal that is 40 to 55 degrees off (reports on DJI Air 3, Mavic 2 Pro, Air 2S),
+# others carry it turned: beyond this the two yaws are no heading to a few degrees.
+MAX_YAWS_APART_DEG = 30.0
 MAX_NAMED = 3  # files of a kind that are named
 MAX_OTHER_LENS_SHARE = 0.1  # of the photos: up to here they are left out, above it which lens is meant is asked
 _ZERO_NAMES = {"agl_m": "a height", "heading_deg": "a heading", "angles": "camera angles"}
@@ -60,6 +65,7 @@ class Photos:
         )
         heights_m = [i.xmp.agl_m for i in infos if i is not None and i.xmp.agl_m is not None]
         check_heights(folder, heights_m, "the height", "photos")
+        self._apart_deg = yaws_apart_deg(infos)
         self._origin = self._make_origin(first, downscaled_camera(self._stored), start)
         self._start_given = start is not None
 
@@ -105,6 +111,9 @@ class Photos:
             Fact("clock", _clock_text(known)),
             *rate_facts([t_s for _, _, t_s in self._photos], "photos"),
         ]
+        if self._apart_deg > MAX_YAWS_APART_DEG:
+            apart = f"GimbalYawDegree and FlightYawDegree are {self._apart_deg:.0f} degrees apart in half of the photos"
+            found.append(Fact("heading", f"{apart}, which is the 1-sigma of the heading; the gimbal's is read"))
         return [*found, *self._left_out()]
 
     def _left_out(self) -> Iterator[Fact]:
@@ -154,7 +163,10 @@ class Photos:
         description = self._description
         if start is None and description.start is None and first.lat_deg is not None and first.lon_deg is not None:
             description = _with_start(description, first.lat_deg, first.lon_deg)
-        return origin_of(description, camera, start, STATED_TILT_SIGMA_DEG)
+        origin = origin_of(description, camera, start, STATED_TILT_SIGMA_DEG)
+        if self._apart_deg <= MAX_YAWS_APART_DEG:
+            return origin
+        return msgspec.structs.replace(origin, yaw_sigma_deg=max(origin.yaw_sigma_deg, self._apart_deg))
 
     def _unclear_lenses(self) -> dict[Path, str]:
         """Photos whose focal length cannot be known beside others whose can, with the reason: they are left out. Raises
@@ -245,6 +257,17 @@ def reported(infos: list[PhotoInfo | None]) -> list[PhotoInfo | None]:
             note = f"{_ZERO_NAMES[key]} of exactly zero in all photos: not reported"
             infos = [None if info is None else _without(info, key, note) for info in infos]
     return infos
+
+
+def yaws_apart_deg(infos: list[PhotoInfo | None]) -> float:
+    """Median difference between the heading by the camera's angles and that of the flight; 0 where both are not
+    stated."""
+    apart = sorted(
+        abs(math.remainder(info.xmp.angles.yaw_deg - info.xmp.flight_yaw_deg, 360.0))
+        for info in infos
+        if info is not None and info.xmp.angles is not None and info.xmp.flight_yaw_deg is not None
+    )
+    return apart[len(apart) // 2] if apart else 0.0
 
 
 def _without(info: PhotoInfo, key: str, note: str) -> PhotoInfo:

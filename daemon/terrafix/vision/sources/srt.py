@@ -11,10 +11,12 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import VehicleState
 from terrafix.vision.sources.xmp import body_angles_from_gimbal
 
-_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
+_FIELD_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{3})\s*-->")
-_HEIGHTS = tuple(re.compile(form + _NUMBER) for form in (r"rel_alt\s*:\s*", r"BAROMETER\s*[:(]\s*", r"\bH\s+"))
-_ANGLES = tuple(re.compile(rf"gb_{axis}\s*:\s*{_NUMBER}") for axis in ("yaw", "pitch", "roll"))
+_HEIGHT_FORMS = tuple(
+    re.compile(form + _FIELD_NUMBER) for form in (r"rel_alt\s*:\s*", r"BAROMETER\s*[:(]\s*", r"\bH\s+")
+)
+_ANGLE_FORMS = tuple(re.compile(rf"gb_{axis}\s*:\s*{_FIELD_NUMBER}") for axis in ("yaw", "pitch", "roll"))
 
 
 def read_srt(path: Path) -> list[VehicleState]:
@@ -29,12 +31,12 @@ def read_srt(path: Path) -> list[VehicleState]:
     for cue, after in zip(cues, [*(cue.start() for cue in cues[1:]), len(text)], strict=True):
         hours, minutes, seconds, ms = map(int, cue.groups())
         block = text[cue.end() : after]
-        height = next((found for form in _HEIGHTS if (found := form.search(block))), None)
-        angles = [found for form in _ANGLES if (found := form.search(block))]
-        if height is None and len(angles) < len(_ANGLES):
+        height = next((found for form in _HEIGHT_FORMS if (found := form.search(block))), None)
+        angles = [found for form in _ANGLE_FORMS if (found := form.search(block))]
+        if height is None and len(angles) < len(_ANGLE_FORMS):
             continue
         yaw, pitch, roll = None, None, None
-        if len(angles) == len(_ANGLES):
+        if len(angles) == len(_ANGLE_FORMS):
             yaw, pitch, roll = body_angles_from_gimbal(*(float(found[1]) for found in angles))
         t_ns = (((hours * 60 + minutes) * 60 + seconds) * 1000 + ms) * 1_000_000
         agl_m = None if height is None else float(height[1])

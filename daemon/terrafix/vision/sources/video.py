@@ -8,10 +8,12 @@ from pathlib import Path
 import cv2
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Frame, GimbalAttitude, Imu, Origin, VehicleState
+from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, Origin, VehicleState
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
-from terrafix.vision.sources.facts import Fact, camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
+from terrafix.vision.sources.facts import camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
+from terrafix.vision.sources.gpmf import read_gpmf
+from terrafix.vision.sources.positions import positions_at
 from terrafix.vision.sources.srt import read_srt
 from terrafix.vision.sources.table import read_table
 
@@ -41,6 +43,7 @@ class Video:
         self._states = sorted([*states, *(self._log.states if self._log else ())], key=lambda state: state.t_ns)
         self._imu: list[Imu] = [] if self._log is None else self._log.imu
         self._gimbal: list[GimbalAttitude] = [] if self._log is None else self._log.gimbal
+        self._gopro = read_gpmf(path)
         self._period_s = 1.0 / rate_hz
         capture = self._open()
         self._fps = capture.get(cv2.CAP_PROP_FPS)
@@ -80,7 +83,18 @@ class Video:
         ]
         if self._log is not None:
             found += log_facts(self._log)
+        if self._gopro is not None:
+            streams = ", ".join(sorted(self._gopro.streams)) or "nothing"
+            text = f"telemetry of {self._gopro.device or 'a GoPro'} in the video ({streams}): positions are truth "
+            text += "(terrafix source truth), axes of the others are not stated"
+            found.append(Fact("left out", text))
         return found
+
+    def truth(self) -> list[tuple[str, float, float]]:
+        """By GoPro's telemetry in the video."""
+        if self._gopro is None or not self._gopro.fixes:
+            raise SourceError(f"{self.path}: has no positions of a GoPro that could be the truth")
+        return positions_at(((shot.frame.file, shot.frame.t_ns) for shot in self.shots()), self._gopro.fixes)
 
     def close(self) -> None:
         """No resource stays open between shots."""

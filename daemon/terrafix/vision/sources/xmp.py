@@ -38,6 +38,7 @@ class Xmp:
 
     angles: BodyAngles | None = None  # of the camera
     heading_deg: float | None = None  # of the vehicle, where the camera's is not known
+    flight_yaw_deg: float | None = None  # of the vehicle, beside angles of the camera
     agl_m: float | None = None  # above take-off (DJI) or ground
     agl_from: str = ""
     focal_px: float | None = None  # of the calibrated size
@@ -72,6 +73,7 @@ def read_xmp(packet: bytes) -> Xmp:
     return Xmp(
         angles=angles,
         heading_deg=heading_deg,
+        flight_yaw_deg=dji["FlightYawDegree"],
         agl_m=agl_m,
         agl_from=agl_from,
         focal_px=focal_px if focal_px is not None and focal_px > 0 else None,

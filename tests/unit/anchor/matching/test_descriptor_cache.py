@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from terrafix.anchor.matching.descriptor_cache import CACHE_BYTES, MapFeatures, put_widened
+from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, MapFeatures, put_widened
 
 
 class Tiles:
@@ -69,4 +69,4 @@ def test_the_cache_holds_no_more_than_its_limit_in_bytes_and_keeps_what_was_used
 
 def test_the_limit_of_the_cache_is_in_memory_of_31_tiles_of_gradients() -> None:
     tile = 8 * 256 * 256 * 2 + 256 * 256
-    assert CACHE_BYTES // tile == 31 and CACHE_BYTES < 35e6
+    assert DESCRIPTOR_CACHE_BYTES // tile == 31 and DESCRIPTOR_CACHE_BYTES < 35e6

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.anchor.matching.layer_selector import MAX_WEIGHT_SUM, MIN_PAIRS, PROBE_INTERVAL, LayerSelector
+from terrafix.anchor.matching.layer_selector import MAX_WEIGHT_SUM, MIN_LAYER_PAIRS, PROBE_INTERVAL, LayerSelector
 
 NOISE = 1.5  # 1-sigma of the scores between frames, common to all layers at one place
 
@@ -75,7 +75,7 @@ def test_the_selection_follows_a_change_of_ground() -> None:
     fly(selector, {"new": 6.0, "old": 4.0}, 100)
     assert selector.best == "new"
     fly(
-        selector, {"new": 1.0, "old": 6.0}, round(MIN_PAIRS + MAX_WEIGHT_SUM)
+        selector, {"new": 1.0, "old": 6.0}, round(MIN_LAYER_PAIRS + MAX_WEIGHT_SUM)
     )  # poor scores: another layer is tried with every frame
     assert selector.best == "old"
 

@@ -1,11 +1,13 @@
 """Orthorectification: alignment with the map to a fraction of a pixel for several attitudes and lenses."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from terrafix.anchor.matching.orthorectify import footprint, patch_centres, rectify
-from terrafix.core.camera import CameraCalibration
+from terrafix.core.camera import CameraCalibration, Readout
 from textured_ground import LENS, PINHOLE, FlatMap, rotation, texture, view
 
 GSD_M = 0.5
@@ -17,12 +19,16 @@ def ground() -> np.ndarray:
     return texture(6, 460.0)
 
 
+@pytest.mark.parametrize("rolling", [False, True])
 @pytest.mark.parametrize("camera", [PINHOLE, LENS])
 @pytest.mark.parametrize("attitude", ATTITUDES)
 def test_the_orthorectified_frame_is_aligned_with_the_map(
-    ground: np.ndarray, camera: CameraCalibration, attitude: tuple[float, ...]
+    ground: np.ndarray, camera: CameraCalibration, attitude: tuple[float, ...], rolling: bool
 ) -> None:
     r, p = rotation(*attitude), np.array([14.3, -22.7, 90.0])
+    if rolling:
+        moved = np.array([0.4, 0.3, -0.5]), r.T @ np.array([15.0, 5.0, 0.0]) / 90.0
+        camera = replace(camera, readout=Readout(0.05 / 359, 179.5, *moved, -r[2]))
     flat = rectify(view(ground, camera, r, p), camera, r, 90.0, GSD_M)
     assert flat is not None
     h, w = flat.mask.shape

@@ -5,7 +5,7 @@ import pytest
 
 from terrafix.anchor.matching.descriptor_cache import MapFeatures
 from terrafix.anchor.matching.orthorectify import rectify
-from terrafix.anchor.matching.patch_matcher import PatchMatches, _peaks, correlate_patches, match_patches
+from terrafix.anchor.matching.patch_matcher import PatchMatches, SearchedMap, _peaks, correlate_patches, match_patches
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, FlatMap, rotation, texture, view
 
@@ -35,7 +35,8 @@ def matched(ground: np.ndarray, world: FlatMap, expected_m: tuple[float, float])
         GSD_M,
     )
     template = describer.describe(frame.image)
-    return match_patches(template, frame, frame.mask, GSD_M, window, valid, (e_min, n_max), expected_m, PATCH, REACH)
+    searched = SearchedMap(window, valid, (e_min, n_max))
+    return match_patches(template, frame, frame.mask, GSD_M, searched, expected_m, PATCH, REACH)
 
 
 @pytest.mark.parametrize("shift_m", [(0.0, 0.0), (0.13, -0.21), (1.4, 2.3), (-3.1, 0.7)])

@@ -13,7 +13,7 @@ import map_rasters
 from terrafix.anchor.node import make_node
 from terrafix.anchor.place_index import index as place_index
 from terrafix.anchor.place_index.faiss_ivf import FaissSearch
-from terrafix.anchor.place_index.format import FAISS, HEADER, POSITIONS, VECTORS, Header, read_header
+from terrafix.anchor.place_index.format import FAISS, HEADER_FILE, POSITIONS, VECTORS, Header, read_header
 from terrafix.anchor.place_index.index import PlaceIndex
 from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.core.config import Places, load
@@ -145,8 +145,8 @@ def test_an_altered_file_is_refused(folder: Path, tmp_path: Path, name: str) -> 
 def changed(folder: Path, copy: Path, **fields: object) -> Path:
     """A copy of an index with another header."""
     shutil.copytree(folder, copy)
-    header = msgspec.json.decode((folder / HEADER).read_bytes(), type=Header)
-    (copy / HEADER).write_bytes(msgspec.json.encode(msgspec.structs.replace(header, **fields)))
+    header = msgspec.json.decode((folder / HEADER_FILE).read_bytes(), type=Header)
+    (copy / HEADER_FILE).write_bytes(msgspec.json.encode(msgspec.structs.replace(header, **fields)))
     return copy
 
 
@@ -159,7 +159,7 @@ def test_a_header_that_does_not_fit_is_refused(folder: Path, tmp_path: Path) -> 
         PlaceIndex.open(changed(folder, tmp_path / "size", size=64))
     broken = tmp_path / "broken"
     broken.mkdir()
-    (broken / HEADER).write_text("{")
+    (broken / HEADER_FILE).write_text("{")
     with pytest.raises(MapError, match="damaged"):
         PlaceIndex.open(broken)
 

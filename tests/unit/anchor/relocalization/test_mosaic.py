@@ -7,7 +7,7 @@ from terrafix.anchor.matching.frame_matcher import Hypothesis
 from terrafix.anchor.matching.ncc import standardise
 from terrafix.anchor.matching.orthorectify import rectify
 from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, BlockCorrelator, Template
-from terrafix.anchor.relocalization.mosaic import MAX_FRAMES, Mosaic, _shifted
+from terrafix.anchor.relocalization.mosaic import MAX_MOSAIC_FRAMES, Mosaic, _shifted
 from terrafix.core.geodesy import local_rotation_up
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, FlatMap, rotation, texture, view
@@ -83,10 +83,10 @@ def test_frames_with_a_large_relative_sigma_or_beyond_the_limit_are_dropped() ->
     mosaic.add(np.array([8.0, 0.0]), 30.0, [blob()], 5.0, 1e3)
     (joined,) = mosaic.templates()
     assert joined.mask.sum() == 120
-    for k in range(MAX_FRAMES + 3):
+    for k in range(MAX_MOSAIC_FRAMES + 3):
         mosaic.add(np.array([8.0 + 24.0 * k, 0.0]), 30.0, [blob()], 5.0, 1e3)
     (joined,) = mosaic.templates()
-    assert joined.mask.sum() == 120 * MAX_FRAMES
+    assert joined.mask.sum() == 120 * MAX_MOSAIC_FRAMES
     mosaic.add(np.array([0.0, 0.0]), 30.0, [blob()], 5.0, 50.0)
     (joined,) = mosaic.templates()
     assert joined.mask.sum() == 120

@@ -10,8 +10,8 @@ from terrafix.map.null_model import (
     DEFAULT_NULL,
     FALSE_DETECTIONS_PER_FLIGHT,
     PRIOR_COUNT,
+    SCORE_VERSION,
     TAIL_QUANTILE,
-    VERSION,
     FalseAlarmBudget,
     NullModel,
     NullRow,
@@ -65,12 +65,12 @@ def test_more_places_raise_the_threshold_and_fewer_do_not_lower_it() -> None:
 
 
 def test_the_row_of_the_nearest_height_is_used_or_the_default_without_a_usable_model() -> None:
-    model = NullModel(version=VERSION, matcher="gradient", rows=(row(80.0), row(160.0)))
+    model = NullModel(version=SCORE_VERSION, matcher="gradient", rows=(row(80.0), row(160.0)))
     assert null_row_for(model, "gradient", 110.0).agl_m == 80.0
     assert null_row_for(model, "gradient", 115.0).agl_m == 160.0
     for unusable in (
         None,
-        msgspec.structs.replace(model, version=VERSION + 1),
+        msgspec.structs.replace(model, version=SCORE_VERSION + 1),
         msgspec.structs.replace(model, matcher="other"),
         msgspec.structs.replace(model, rows=()),
     ):

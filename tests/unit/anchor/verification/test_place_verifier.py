@@ -12,7 +12,12 @@ from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
 from terrafix.anchor.matching.match_message import relocalized_match
 from terrafix.anchor.verification.hypothesis_tracker import TRACK_LLR_MAX, evidence
 from terrafix.anchor.verification.patch_null import PatchNull
-from terrafix.anchor.verification.place_verifier import CELL_PER_AGL, FINE_CELL_PER_AGL, PlaceVerifier, VerifiedPlace
+from terrafix.anchor.verification.place_verifier import (
+    FINE_PLACE_CELL_PER_AGL,
+    PLACE_CELL_PER_AGL,
+    PlaceVerifier,
+    VerifiedPlace,
+)
 from terrafix.messages import MapMatch, MatchPlace, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import GSD_M, PINHOLE, FlatMap, rotation, texture, view
@@ -44,19 +49,19 @@ def image() -> np.ndarray:
 
 
 def verified_place(
-    verifier: PlaceVerifier, image: np.ndarray, proposed: View, cell_per_agl: float = CELL_PER_AGL
+    verifier: PlaceVerifier, image: np.ndarray, proposed: View, cell_per_agl: float = PLACE_CELL_PER_AGL
 ) -> VerifiedPlace:
     found = verifier.verify(image, proposed, cell_per_agl)
     assert found is not None
     return found
 
 
-@pytest.mark.parametrize("cell_per_agl", [CELL_PER_AGL, FINE_CELL_PER_AGL])
+@pytest.mark.parametrize("cell_per_agl", [PLACE_CELL_PER_AGL, FINE_PLACE_CELL_PER_AGL])
 def test_the_right_place_has_full_evidence_and_the_right_pose(
     verifier: PlaceVerifier, image: np.ndarray, cell_per_agl: float
 ) -> None:
     found = verified_place(verifier, image, PROPOSED_VIEW, cell_per_agl)
-    assert evidence(PatchNull().sigmas(found.consensus, fine=cell_per_agl == FINE_CELL_PER_AGL)) == TRACK_LLR_MAX
+    assert evidence(PatchNull().sigmas(found.consensus, fine=cell_per_agl == FINE_PLACE_CELL_PER_AGL)) == TRACK_LLR_MAX
     pose = found.fix.pnp.fit
     assert pose is not None and found.fix.pnp.verdict is Verdict.ACCEPTED
     off_m = pose.p_c_in_w_m - HERE_M
@@ -80,7 +85,7 @@ def test_wrong_places_score_like_the_null_model(
 
 
 def test_a_place_off_the_map_is_not_verified(verifier: PlaceVerifier, image: np.ndarray) -> None:
-    assert verifier.verify(image, replace(PROPOSED_VIEW, e_m=900.0), CELL_PER_AGL) is None
+    assert verifier.verify(image, replace(PROPOSED_VIEW, e_m=900.0), PLACE_CELL_PER_AGL) is None
 
 
 def leaning(ground: np.ndarray, seed: int) -> np.ndarray:
@@ -105,7 +110,7 @@ def test_the_covariance_of_a_relocalized_pose_covers_the_displacement_by_leaning
         here_m[:2] += np.random.default_rng(seed).uniform(-40.0, 40.0, 2)
         image = view(leaning(ground, seed), PINHOLE, rotation(HEADING_DEG), here_m)
         proposed = replace(PROPOSED_VIEW, e_m=float(here_m[0]) + 5.0, n_m=float(here_m[1]) - 4.0, tilt_sigma_rad=0.005)
-        fix = verified_place(verifier, image, proposed, FINE_CELL_PER_AGL).fix
+        fix = verified_place(verifier, image, proposed, FINE_PLACE_CELL_PER_AGL).fix
         before = msgspec.structs.replace(empty, place=MatchPlace(e_m=proposed.e_m, n_m=proposed.n_m, mass=1.0))
         match = relocalized_match(before, fix, proposed, (0.0, 0.0))
         assert match.verdict is Verdict.ACCEPTED and match.search.relocalized and match.pose is not None

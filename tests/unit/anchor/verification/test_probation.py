@@ -21,7 +21,7 @@ from terrafix.anchor.verification.hypothesis_tracker import (
     PlaceHypothesis,
 )
 from terrafix.anchor.verification.lock_monitor import MIN_GAIN
-from terrafix.anchor.verification.place_verifier import FINE_CELL_PER_AGL
+from terrafix.anchor.verification.place_verifier import FINE_PLACE_CELL_PER_AGL
 from terrafix.anchor.verification.probation import (
     E_VALUE_EXPONENT,
     FAIL_LOG_ODDS,
@@ -106,7 +106,7 @@ def test_a_place_without_evidence_fails_after_some_stretches_of_ground(ground: n
     ]
     for image in images:  # estimates the null model of this ground, as a search does
         for e_m in (-50.0, 0.0, 50.0):
-            checked = tracks.verifier.verify(image, replace(HERE, e_m=e_m, n_m=20.0), FINE_CELL_PER_AGL)
+            checked = tracks.verifier.verify(image, replace(HERE, e_m=e_m, n_m=20.0), FINE_PLACE_CELL_PER_AGL)
             assert checked is not None
             tracks.null.add(checked.consensus, fine=True)
     test, frames = Probation(tracks, DEFAULT_NULL.frame, AGL_M), 0

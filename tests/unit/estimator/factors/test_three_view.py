@@ -9,7 +9,7 @@ from gtsam.symbol_shorthand import B, C, F
 
 from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.three_view import (
-    MIN_TRIPLES,
+    MIN_FACTOR_TRIPLES,
     ThreeViewConstraint,
     ThreeViewPose,
     three_view_constraint,
@@ -113,7 +113,7 @@ def test_the_radial_coefficient_is_observable() -> None:
 def test_short_translations_and_few_points_give_no_constraint() -> None:
     flown = ThreeCameras(5)
     guess = flown.guess()
-    assert three_view_constraint(flown.triples[: MIN_TRIPLES - 1], SIGMA, guess, FOCAL_SIGMA) is None
+    assert three_view_constraint(flown.triples[: MIN_FACTOR_TRIPLES - 1], SIGMA, guess, FOCAL_SIGMA) is None
     short = replace(guess, last=gtsam.Pose3(guess.last.rotation(), 0.05 * guess.last.translation()))
     assert three_view_constraint(flown.triples, SIGMA, short, FOCAL_SIGMA) is None
 

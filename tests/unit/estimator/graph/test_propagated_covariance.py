@@ -7,7 +7,12 @@ from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.graph.elimination import NODE_SIZE, values_of
-from terrafix.estimator.graph.propagated_covariance import CALIBRATION, MOTION, POSE, PropagatedCovariance
+from terrafix.estimator.graph.propagated_covariance import (
+    CALIBRATION_BLOCK,
+    MOTION_BLOCK,
+    POSE_BLOCK,
+    PropagatedCovariance,
+)
 from terrafix.estimator.state import CALIBRATION_SIZE, MOTION_SIZE, POSE_SIZE, NodeState
 
 PARENT_OF = {1: 0, 2: 0, 3: 2, 4: 2, 5: 4, 6: 4}
@@ -29,7 +34,11 @@ class Tree:
             for n in (0, *PARENT_OF)
         }
         cov = self.cov(NODE_SIZE)
-        for key, at, part in ((C, POSE, POSE_SIZE), (B, CALIBRATION, CALIBRATION_SIZE), (V, MOTION, MOTION_SIZE)):
+        for key, at, part in (
+            (C, POSE_BLOCK, POSE_SIZE),
+            (B, CALIBRATION_BLOCK, CALIBRATION_SIZE),
+            (V, MOTION_BLOCK, MOTION_SIZE),
+        ):
             assert at.stop - at.start == part
             cov[at, : at.start] = cov[at, at.stop :] = 0.0  # the priors of a graph are of one variable each
             self.graph.add(self.prior(key, 0, cov[at, at]))

@@ -4,12 +4,16 @@ import msgspec
 import numpy as np
 import pytest
 
+import inertial_flight
 from inertial_flight import ORIGIN as INERTIAL_ORIGIN
 from inertial_flight import InertialFlight
 from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of, t_ns
 from terrafix.core.camera import Mount
-from terrafix.estimator.integrity.offset_drift import GRID_S, RATES, Hazards, predicted
-from terrafix.estimator.integrity.time_offset import MAX_SLEW, TimeOffset
+from terrafix.core.gate import GATE
+from terrafix.core.geodesy import LocalFrame
+from terrafix.estimator.integrity.innovation import Innovation
+from terrafix.estimator.integrity.offset_drift import DRIFT_GRID_S, RATES, Hazards, predicted
+from terrafix.estimator.integrity.time_offset import MAX_SLEW, Contradiction, TimeOffset
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.pose_estimator import EstimatedFlight
 from terrafix.messages import (
@@ -23,6 +27,7 @@ from terrafix.messages import (
     VehicleState,
     Verdict,
 )
+from terrafix_tools.mission.items import AltitudeFrame, Do, Item, Mission
 
 R_B_C = Mount.of(CAMERA).r_b_c()
 
@@ -30,6 +35,13 @@ R_B_C = Mount.of(CAMERA).r_b_c()
 def grown(t_s: float) -> float:
     """A buffer that fills from 20 s on: a second in 20."""
     return float(np.clip((t_s - 20.0) / 20.0, 0.0, 1.2))
+
+
+def straight_course(seed: int, length_m: float, box: object, frame: LocalFrame, *, agl_m: float) -> Mission:
+    """In place of ``course``: to the north-east, without a turn."""
+    ends = [frame.to_wgs84(1.0 * along_m, 0.5 * along_m) for along_m in (-1500.0, 1500.0)]
+    items = [Item(Do.WAYPOINT, i, *end, agl_m, AltitudeFrame.GROUND) for i, end in enumerate(ends, start=1)]
+    return Mission("straight", *ends[0], tuple(items))
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +79,14 @@ def test_an_offset_that_grows_is_followed(plane: InertialFlight) -> None:
     assert offset.applied_s > 0.3 and abs(1.2 - offset.applied_s) < 3.0 * offset.sigma_s
 
 
+@pytest.mark.parametrize("seed", [3, 8])
+def test_gusts_in_straight_flight_show_a_camera_that_is_late(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    monkeypatch.setattr(inertial_flight, "course", straight_course)
+    offset = offset_of(InertialFlight(seed, 70, 25, delay=lambda t_s: 1.4 * (t_s > 20.0)))
+    assert offset.estimate[0] == pytest.approx(1.4, abs=3.0 * offset.estimate[1])
+    assert offset.applied_s == pytest.approx(1.4, abs=0.3)
+
+
 def test_without_attitudes_nothing_is_compared_and_views_do_not_pile_up() -> None:
     telemetry, offset = Telemetry(), TimeOffset(R_B_C)
     view = {"keyframe_id": 0, "verdict": "accepted", "two_view": [(0.1, 0.1, 0.1, 0.1)] * 8}
@@ -81,7 +101,7 @@ def straight(seen: float) -> TimeOffset:
     """A vehicle flies level with 20 m/s at 100 m for 25 s. From 15 s on images show the share ``seen`` of it."""
     telemetry, offset = Telemetry(), TimeOffset(R_B_C)
     rng = np.random.default_rng(5)
-    offset.buffered, offset._noise = True, [np.radians(0.2) ** 2, 0.005**2]  # as learnt in some minutes
+    offset.buffered = True
     for i in range(50):
         for part_ns in range(0, 500_000_000, 100_000_000):
             at_ns = i * 500_000_000 + part_ns
@@ -91,7 +111,11 @@ def straight(seen: float) -> TimeOffset:
             )
             telemetry.add_imu(Imu(t_ns=at_ns, source="test", samples=samples))
         way = 0.1 * (seen if i >= 30 else 1.0)
-        pairs = [(x, y, x - way + rng.normal(0.0, 1e-3), y) for x in (-0.2, 0.0, 0.2, 0.3) for y in (-0.2, 0.2)]
+        pairs = [
+            (x, y, x - way + rng.normal(0.0, 1e-3), y)
+            for x in np.linspace(-0.7, 0.7, 8)
+            for y in (-0.3, -0.1, 0.0, 0.1, 0.3)
+        ]
         view = Odometry(
             t_ns=i * 500_000_000, frame_id=i, keyframe_id=max(i - 1, 0), verdict=Verdict.ACCEPTED, two_view=pairs
         )
@@ -110,7 +134,7 @@ def test_in_straight_flight_a_drift_shows_as_a_velocity_that_changes_without_acc
 
 def test_an_offset_that_nothing_observes_is_claimed_once_its_buffer_may_have_filled() -> None:
     """Of an hour in which a buffer begins to fill once, 5 % are three minutes."""
-    mass = np.zeros((len(RATES), len(GRID_S)))
+    mass = np.zeros((len(RATES), len(DRIFT_GRID_S)))
     mass[0, 40] = 1.0
     hourly = Hazards(1.0 / 3600.0, 0.0)
     away = [1.0 - predicted(mass, 1.0, hourly)[:, 40].sum()]
@@ -148,7 +172,7 @@ class LateCamera(TimeOffset):
 
     @property
     def density(self) -> np.ndarray:
-        return np.where(np.abs(GRID_S - 1.0) < 0.01, 1.0, 0.0)
+        return np.where(np.abs(DRIFT_GRID_S - 1.0) < 0.01, 1.0, 0.0)
 
     def add(self, odometry: Odometry, telemetry: Telemetry, agl_m: float) -> None:
         self.stamps_ns.append(odometry.t_ns)
@@ -180,8 +204,8 @@ class KnownTo(TimeOffset):
     @property
     def density(self) -> np.ndarray:
         one_sigma_s, share = self._known
-        wide = np.exp(-0.5 * (GRID_S / one_sigma_s) ** 2)
-        return share * wide / wide.sum() + (1.0 - share) * (np.abs(GRID_S) < 0.01)
+        wide = np.exp(-0.5 * (DRIFT_GRID_S / one_sigma_s) ** 2)
+        return share * wide / wide.sum() + (1.0 - share) * (np.abs(DRIFT_GRID_S) < 0.01)
 
 
 @pytest.mark.parametrize(("share", "sigma_s"), [(0.01, STAMP_SIGMA_S), (1.0, 0.3)])
@@ -221,3 +245,25 @@ def test_the_prior_of_the_offset_is_what_the_source_knows_of_its_stamps(sigma_s:
     offset.stamped(Frame(t_ns=0, frame_id=0, file="", width=1, height=1, buffered=True, stamp_sigma_s=sigma_s))
     assert offset.buffered and offset.applied_s == 0.0
     assert sigma_s <= offset.sigma_s <= 1.5 * sigma_s  # 1 % of the cameras may be off by anything
+
+
+@pytest.mark.parametrize(("off_m", "late_s"), [((-28.0, 0.5), 1.4), ((28.0, 0.5), -1.4), ((-0.5, 28.0), 0.0)])
+def test_an_image_that_jumps_along_the_track_is_one_of_another_time_and_one_beside_it_is_not(
+    off_m: tuple[float, float], late_s: float
+) -> None:
+    """A plane with 20 m/s to the east; the map repeats what the images show."""
+    offset = TimeOffset(R_B_C)
+    offset.buffered = True
+    off = Innovation(np.array(off_m), np.eye(2), GATE[2])
+    for by_map in (False, True):
+        offset.contradict(Contradiction(0, off, np.array([20.0, 0.0]), 120.0), Telemetry(), by_map=by_map)
+    assert offset.estimate[0] == pytest.approx(late_s, abs=0.1)
+    (fault,) = offset.take_changes(0) or (None,)
+    assert (fault is not None and fault.active) == (late_s != 0.0)
+
+
+def test_a_vehicle_that_hovers_learns_nothing_of_the_time_from_an_image_that_jumps() -> None:
+    offset, before = TimeOffset(R_B_C), TimeOffset(R_B_C)
+    off = Innovation(np.array([-20.0, 0.0]), np.eye(2), GATE[2])
+    offset.contradict(Contradiction(0, off, np.zeros(2), 120.0), Telemetry(), by_map=False)
+    assert offset.density == pytest.approx(before.density)

@@ -8,7 +8,7 @@ import pytest
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.telemetry_buffer import (
     MAX_ATTITUDE_GAP_NS,
-    MAX_GAP_NS,
+    MAX_STATE_GAP_NS,
     TURN_UNSEEN_RAD,
     UNKNOWN_ATTITUDE_RAD,
     Attitude,
@@ -38,13 +38,13 @@ def test_between_two_reports_of_the_slowest_stream_nothing_is_added() -> None:
 
 
 def test_the_uncertainty_grows_to_that_of_an_unreported_attitude() -> None:
-    attitudes = [attitude_after(gap_ns) for gap_ns in range(200_000_000, MAX_GAP_NS, 100_000_000)]
+    attitudes = [attitude_after(gap_ns) for gap_ns in range(200_000_000, MAX_STATE_GAP_NS, 100_000_000)]
     assert np.all(np.diff([attitude.righted_rad for attitude in attitudes]) > 0.0)
-    last = attitude_after(MAX_GAP_NS)
+    last = attitude_after(MAX_STATE_GAP_NS)
     assert last.yaw_rad == 1.0
     assert 0.8 * UNKNOWN_ATTITUDE_RAD < last.righted_rad < UNKNOWN_ATTITUDE_RAD
     assert last.turned_rad / TURN_UNSEEN_RAD == pytest.approx(last.righted_rad / UNKNOWN_ATTITUDE_RAD)
-    assert attitude_after(MAX_GAP_NS + 1).yaw_rad is None
+    assert attitude_after(MAX_STATE_GAP_NS + 1).yaw_rad is None
 
 
 def test_a_height_alone_is_no_stale_attitude() -> None:

@@ -13,7 +13,7 @@ from inertial_flight import ORIGIN, InertialFlight, flown
 from terrafix.core.geodesy import local_rotation_up, rot_w_b
 from terrafix.estimator.factors.focal import FocalKey
 from terrafix.estimator.factors.motion import motion_factor
-from terrafix.estimator.factors.noise import HUBER_K
+from terrafix.estimator.factors.noise import FACTOR_HUBER_K
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
 from terrafix.estimator.models.motion_model import (
     MANOEUVRE_CORRELATION_S,
@@ -262,7 +262,9 @@ def test_the_jacobians_of_the_motion_factor_match_numerical_differences(measured
             moved.insert(key, step)
             numeric.append((factor.unwhitenedError(values.retract(moved)) - factor.unwhitenedError(values)) / 1e-5)
     off = float(np.linalg.norm(whitened @ factor.unwhitenedError(values)))
-    numeric_w = whitened @ np.array(numeric).T * (np.sqrt(min(1.0, HUBER_K / off)) if above and not measured else 1.0)
+    numeric_w = (
+        whitened @ np.array(numeric).T * (np.sqrt(min(1.0, FACTOR_HUBER_K / off)) if above and not measured else 1.0)
+    )
     assert analytic.T @ analytic == pytest.approx(numeric_w.T @ numeric_w, rel=1e-3, abs=1e-2 * np.abs(analytic).max())
 
 
@@ -348,7 +350,7 @@ def test_an_increment_in_heights_as_seen_does_not_constrain_the_focal_length(mea
 
 @pytest.mark.parametrize(
     ("measured", "above", "cost"),
-    [(True, False, 50.0), (False, False, 50.0), (False, True, HUBER_K * (10.0 - 0.5 * HUBER_K))],
+    [(True, False, 50.0), (False, False, 50.0), (False, True, FACTOR_HUBER_K * (10.0 - 0.5 * FACTOR_HUBER_K))],
 )
 def test_only_an_increment_without_imu_in_height_units_has_a_huber_loss(
     measured: bool, above: bool, cost: float

@@ -16,9 +16,9 @@ from terrafix.estimator.keyframe_view import KeyframeView
 from terrafix.estimator.measurements.ground_plane_motion import ground_below
 from terrafix.estimator.measurements.map_pose import measured_pose
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
-from terrafix.estimator.models.plane_motion import Ground
+from terrafix.estimator.models.plane_motion import Ground, MatchedRays
 from terrafix.estimator.models.terrain import Terrain
-from terrafix.estimator.models.terrain_roughness import CANDIDATES, PRIOR
+from terrafix.estimator.models.terrain_roughness import PRIOR, ROUGHNESS_CANDIDATES
 from terrafix.estimator.node import EstimatorNode
 from terrafix.estimator.state import CALIBRATION_SIZE
 from terrafix.messages import (
@@ -33,7 +33,7 @@ from terrafix.messages import (
     Verdict,
 )
 
-RISE = float(np.sqrt(PRIOR @ CANDIDATES**2))  # prior
+RISE = float(np.sqrt(PRIOR @ ROUGHNESS_CANDIDATES**2))  # prior
 
 ORIGIN = Origin(
     t_ns=0,
@@ -153,7 +153,7 @@ def test_the_curvature_of_the_ground_is_in_the_noise_of_odometry(along: tuple[fl
         known = gtsam.noiseModel.Isotropic.Sigma
         graph.add(gtsam.PriorFactorPose3(C(0), keyframe, known(6, 1e-6)))
         graph.add(gtsam.PriorFactorVector(B(1), np.zeros(CALIBRATION_SIZE), known(CALIBRATION_SIZE, 1e-6)))
-        graph.add(plane_two_view_factor(C(0), C(1), B(1), keyframe, pose, pairs, 1e-4, ground))
+        graph.add(plane_two_view_factor(C(0), C(1), B(1), keyframe, pose, MatchedRays(pairs, 1e-4, ground)))
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
         turned = gtsam.Rot3.Logmap(looks_down.between(solved.atPose3(C(1)).rotation()))
         cov = gtsam.Marginals(graph, solved).marginalCovariance(C(1))[:3, :3]
@@ -183,7 +183,7 @@ def test_a_sloping_plane_does_not_make_the_horizontal_position_observable() -> N
     points = np.column_stack([seen[:, 0] * depth, -seen[:, 1] * depth, 100.0 - depth])
     in_pose = (points - pose.translation()) @ looks_down
     pairs = np.column_stack([seen, in_pose[:, :2] / in_pose[:, 2:]])
-    factor = plane_two_view_factor(0, 1, 2, keyframe, pose, pairs, 1e-3, sloping)
+    factor = plane_two_view_factor(0, 1, 2, keyframe, pose, MatchedRays(pairs, 1e-3, sloping))
 
     def error(moved_m: tuple[float, float, float]) -> float:
         values = gtsam.Values()

@@ -20,7 +20,7 @@ from terrafix.estimator.monitors.cusum import MARGIN, MAX_STEP, Cusum, threshold
 from terrafix.estimator.monitors.image_shape import ASPECT_RATIOS, ShapeMonitor
 from terrafix.estimator.monitors.inertial import MIN_CHANGE_MPS, MIN_WINDOW_S, MOUNT_YAWS_DEG, InertialMonitor
 from terrafix.estimator.monitors.map_offsets import OffsetMonitor, log_height_ratio
-from terrafix.estimator.monitors.registration import ERROR_PER_PATH, MIN_SPACING_HEIGHTS, Registration
+from terrafix.estimator.monitors.registration import ERROR_PER_PATH, REGISTRATION_SPACING_HEIGHTS, Registration
 from terrafix.estimator.monitors.turns import TurnMonitor
 from terrafix.estimator.monitors.visual_motion import visual_motion
 from terrafix.messages import ON_DRAWN, CalibrationFault, MapMatch, Message, Odometry, VehicleState, Verdict
@@ -209,7 +209,7 @@ def test_the_log_height_ratio_of_feet_for_metres_is_log_3_28() -> None:
 
 def _attempts(monitor: Registration, count: int, *, found: bool) -> None:
     for _ in range(count):
-        monitor.add_path(MIN_SPACING_HEIGHTS * HEIGHT_M, HEIGHT_M)
+        monitor.add_path(REGISTRATION_SPACING_HEIGHTS * HEIGHT_M, HEIGHT_M)
         monitor.add_attempt(found=found)
 
 
@@ -270,7 +270,7 @@ def test_the_path_since_the_last_match_bounds_the_error_of_a_wrong_description(
     _attempts(monitor, 1, found=False)
     once_m = monitor.path_error_m
     _attempts(monitor, 3, found=False)
-    assert once_m == ERROR_PER_PATH * MIN_SPACING_HEIGHTS * HEIGHT_M
+    assert once_m == ERROR_PER_PATH * REGISTRATION_SPACING_HEIGHTS * HEIGHT_M
     assert monitor.path_error_m == pytest.approx(4.0 * once_m)
     _attempts(monitor, 6, found=True)
     assert agreement.probability(Cause.DESCRIPTION) == 0.0

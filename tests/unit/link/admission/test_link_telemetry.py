@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from link_rig import MS, S
 from link_wire import WiredEdge, heartbeat, packed, states
 from terrafix import messages as m
-from terrafix.link.admission.boot_clock import CONFIRM_NS, MAX_BACKWARD_STEP_MS, WRAP_MS, BootClock, boot_step_ms
+from terrafix.link.admission.boot_clock import BOOT_CONFIRM_NS, MAX_BACKWARD_STEP_MS, WRAP_MS, BootClock, boot_step_ms
 from terrafix.link.admission.sequence_numbers import (
     MAX_LATE,
     MAX_LOST,
@@ -139,7 +139,7 @@ def test_a_reboot_is_accepted_after_one_second_of_only_the_new_time() -> None:
     clock = BootClock()
     clock.rejection_reason(100_000, S)
     accepted_flags = [bool(clock.rejection_reason(i * 20, 2 * S + i * 20 * MS)) for i in range(100)]
-    assert accepted_flags == [True] * (CONFIRM_NS // (20 * MS)) + [False] * (100 - CONFIRM_NS // (20 * MS))
+    assert accepted_flags == [True] * (BOOT_CONFIRM_NS // (20 * MS)) + [False] * (100 - BOOT_CONFIRM_NS // (20 * MS))
     assert clock.reboots == 1
 
 

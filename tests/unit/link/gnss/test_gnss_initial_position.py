@@ -12,7 +12,7 @@ from terrafix import messages as m
 from terrafix.link.gnss.initial_position import (
     MAX_CLAIMED_SIGMA_M,
     MAX_TRANSPORT_SPEED_MPS,
-    MOVED_SIGMAS,
+    START_MOVED_SIGMAS,
     STATIONARY_NS,
 )
 from terrafix.link.gnss.spoofing_detector import DEFAULT_RECEIVER_SIGMA_M, MIN_RECEIVER_SIGMA_M
@@ -152,7 +152,7 @@ def test_the_start_is_withdrawn_while_the_vehicle_is_carried_and_published_at_it
     first, withdrawn, last = starts(published)
     assert distance_to_m(first, (300.0, -200.0)) < 0.1 and distance_to_m(last, (360.0, -200.0)) < 0.1
     assert (withdrawn.lat_deg, withdrawn.lon_deg, withdrawn.sigma_m) == (None, None, None)
-    reached_s = 20.0 + MOVED_SIGMAS * math.hypot(2.0, 2.0) / 1.5
+    reached_s = 20.0 + START_MOVED_SIGMAS * math.hypot(2.0, 2.0) / 1.5
     assert reached_s < withdrawn.t_ns / S < reached_s + 1.0 and 64.0 < last.t_ns / S < 66.0
     assert [t for t in texts(published) if "GPS" in t] == ["Terrafix: GPS 1 moves: no start"]
 

@@ -8,7 +8,7 @@ import pytest
 from link_rig import LAT, LON, MS, SPEED_EAST, S, estimate
 from terrafix.link.gnss.offset_predictor import HORIZON_S, OffsetPredictor
 from terrafix.link.gnss.predictor_noise import MIN_POSITION_SCALE, PRIOR_SAMPLES, PredictionErrors, PredictorNoise
-from terrafix.link.gnss.spoofing_detector import DRAG_P_VALUE, JUMP_GATE_SIGMAS, SpoofingDetector
+from terrafix.link.gnss.spoofing_detector import DRAG_P_VALUE, GNSS_JUMP_SIGMAS, SpoofingDetector
 from terrafix.link.integrity.output_predictor import InertialBuffer, offset, predict_to
 from terrafix.messages import GnssReading, GnssState
 
@@ -67,7 +67,7 @@ def test_a_constant_offset_is_learnt_and_a_change_of_it_is_detected() -> None:
     detected_s = next(k for k, p_value in enumerate(walking) if p_value < DRAG_P_VALUE) * DT_S
     assert detected_s < 29.0
     distance_m = abs(steady + detected_s)
-    assert distance_m < JUMP_GATE_SIGMAS * 6.0  # the distance test gives no alarm yet
+    assert distance_m < GNSS_JUMP_SIGMAS * 6.0  # the distance test gives no alarm yet
 
 
 def test_the_drift_against_our_velocity_detects_a_drag_off_earlier() -> None:

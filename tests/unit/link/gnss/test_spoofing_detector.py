@@ -7,11 +7,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gnss_rig import accurate, feed_receiver, reading
-from link_rig import MS, S, estimate
+from link_rig import LAT, LON, MS, SPEED_EAST, S, estimate
 from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
 from terrafix.link.autopilot.gnss_receiver import gnss_reading
 from terrafix.link.gnss.monitor import MIN_VISION_NS
+from terrafix.link.integrity.output_predictor import offset
 from terrafix.link.node import LinkNode
 from terrafix.messages import GnssState
 from terrafix_lab.sim.gnss_evaluation.flight import Vision, fly
@@ -155,6 +156,25 @@ def test_there_is_no_switch_before_arming_nor_for_a_receiver_that_never_had_a_fi
     assert not [x for x in feed_receiver(node, 20.0, lambda _: None) if isinstance(x, m.PositionSource)]
     without_fix = feed_receiver(LinkNode(10.0, "act"), 20.0, lambda t: accurate(t) if t > 1.0 else None)
     assert not [x for x in without_fix if isinstance(x, m.PositionSource)]
+
+
+@pytest.mark.parametrize(("autopilot_m", "switches"), [(None, False), (150.0, True), (250.0, False)])
+def test_the_switch_to_the_map_is_a_step_of_200_m_at_most(autopilot_m: float | None, switches: bool) -> None:
+    """``autopilot_m``: from our position to where the autopilot takes itself to be; None: it reports no position."""
+    node, published = LinkNode(10.0, "act"), []
+
+    def where(t_s: float) -> tuple[float, float]:
+        if autopilot_m is not None:
+            lat_deg, lon_deg = offset(LAT, LON, SPEED_EAST * t_s, autopilot_m)
+            status = {"t_ns": round(t_s * S), "flags": 831, "position_ratio": 0.1, "velocity_ratio": 0.1}
+            published.extend(node.on(m.EkfStatus(**status, lat_deg=lat_deg, lon_deg=lon_deg)))
+        return accurate(t_s) if t_s < 20.0 else (300.0, 0.0)
+
+    published += feed_receiver(node, 30.0, where)
+    assert [x.vision for x in published if isinstance(x, m.PositionSource)] == [True] * switches
+    told = [x.text for x in published if isinstance(x, m.StatusText) and "not switched" in x.text]
+    step_m = 300 if autopilot_m is None else autopilot_m
+    assert told == ([] if switches else [f"Terrafix: not switched: the map is {step_m:.0f} m off"])
 
 
 def test_there_is_no_switch_while_one_receiver_is_trusted() -> None:

@@ -11,7 +11,7 @@ from link_rig import MS, S, estimate, every, fly, gps, texts
 from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
 from terrafix.link.node import LinkNode
-from terrafix.link.pilot_text.debounce import MAX_INTERVAL_NS, RESET_AFTER_NS, Debounce
+from terrafix.link.pilot_text.debounce import MAX_TEXT_INTERVAL_NS, RESET_AFTER_NS, Debounce
 
 MAX_CHARACTERS = 50  # characters of STATUSTEXT
 KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
@@ -126,7 +126,7 @@ def test_the_last_reported_state_is_the_true_one() -> None:
             now_ns += draw.randint(1, 20) * S
             state = draw.random() < 0.5
             reported = state if debounce.due(state, now_ns) else reported
-        assert debounce.due(state, now_ns + MAX_INTERVAL_NS) or reported == state
+        assert debounce.due(state, now_ns + MAX_TEXT_INTERVAL_NS) or reported == state
 
 
 def test_after_a_stable_period_the_debounce_interval_is_short_again() -> None:

@@ -79,6 +79,16 @@ def test_a_track_and_the_points_of_a_planner_are_paths(tmp_path: Path) -> None:
     assert beside.notes == ("4 point(s) beside the outlines are left out",)
 
 
+def test_a_link_to_another_document_is_named(tmp_path: Path) -> None:
+    """As Google Earth saves a place that it shows from the network."""
+    link = "<NetworkLink><Link><href>https://maps.example/area.kml</href></Link></NetworkLink>"
+    with pytest.raises(UsageError, match=r"n.kml: has no shape of its own, only a link to https://maps.example/area.k"):
+        read_area(written(tmp_path / "n.kml", link), buffer_km=0.0)
+    beside = read_area(written(tmp_path / "b.kml", f"<MultiGeometry>{BOX}</MultiGeometry>{link}"), buffer_km=0.0)
+    assert check_area(beside) == pytest.approx(BOX_KM2, rel=0.01)
+    assert beside.notes == ("1 link(s) to other documents are not followed",)
+
+
 @pytest.mark.parametrize("inside", ["doc.kml", "files/area.kml", "wpmz/waylines.wpml"])
 def test_an_archive_is_read_by_its_document(tmp_path: Path, inside: str) -> None:
     """DJI's archives hold a template beside the flown route."""

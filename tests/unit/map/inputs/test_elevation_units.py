@@ -93,7 +93,8 @@ NAMES = {
     "US survey foot": "US survey foot", "US survey feet": "US survey foot", "ftUS": "US survey foot",
     "us-ft": "US survey foot", "Foot_US": "US survey foot", "cm": "centimetre", "centimeters": "centimetre",
     "km": "kilometre", "decimeter": "dm", "yard": "yard", "fathom": "fathom",
-    "British foot (Sears 1922)": "British foot (Sears 1922)",
+    "British foot (Sears 1922)": "British foot (Sears 1922)", "U.S. Survey Feet": "US survey foot",
+    "foot_US": "US survey foot", "foot (international)": "foot", "decimetre": "dm", "millimetres": "millimetre",
 }  # fmt: skip
 
 
@@ -154,6 +155,8 @@ def test_feet_with_a_scale_are_both(tmp_path: Path, ortho: Path) -> None:
     [
         ({"unit": "furlong fortnight"}, r"the unit of its heights, 'furlong fortnight', is not known; give --dem-unit"),
         ({"unit": "degree"}, "'degree', is not known"),
+        ({"unit": "0.1 m"}, "'0.1 m', is not known"),
+        ({"unit": "1/100 ft"}, "'1/100 ft', is not known"),
         ({"unit": "metre", "crs": "EPSG:32651+6360"}, "band is in 'metre', its vertical .* 'US survey foot'; give"),
         ({"crs": "EPSG:2264"}, "not say the unit of its heights, and its coordinates are in 'US survey foot'; give"),
         ({"crs": CRS.from_epsg(32651).to_3d().to_wkt()}, r"count from the ellipsoid .*--geoid.*--dem-datum"),
@@ -203,6 +206,18 @@ def test_ellipsoidal_heights_of_the_file_are_converted_or_refused(tmp_path: Path
     assert ground_m(package) == pytest.approx(plane_m(CENTRE[0]) - geoid_m, abs=0.03)
     assert undulation_m(0, 0) == pytest.approx(geoid_m, abs=0.1)  # the same grid as that of the other test
     assert "heights converted from ellipsoid to EGM96" in elevation_line(package)
+
+
+@pytest.mark.parametrize(
+    "name", ["WGS_1984", "GRS 1980 height", "D_WGS_1984", "NAD83(2011)", "ITRF2014", "Ellipsoid (metre)"]
+)
+def test_a_vertical_system_with_the_name_of_an_ellipsoid_counts_from_it(tmp_path: Path, ortho: Path, name: str) -> None:
+    """As Esri writes ellipsoidal heights."""
+    horizontal = CRS.from_epsg(32651).to_wkt("WKT1_GDAL")
+    vertical = f'VERT_CS["{name}",VERT_DATUM["{name}",2005],UNIT["metre",1],AXIS["Up",UP]]'
+    dem = write_dem(tmp_path / "d.tif", crs=f'COMPD_CS["c",{horizontal},{vertical}]')
+    with pytest.raises(MapError, match="its heights count from the ellipsoid"):
+        build(ortho, tmp_path / "m.gpkg", dem=dem)
 
 
 def test_a_drape_of_a_simulated_flight_converts_feet_too(tmp_path: Path, ortho: Path) -> None:

@@ -92,6 +92,18 @@ def test_alpha_wins_over_nodata(tmp_path: Path, grid: str, nodata: str) -> None:
     assert ("alpha band is the mask" in text) if nodata in ("255", "0") else (f"{nodata} ignored, uint8 cannot" in text)
 
 
+@pytest.mark.parametrize("grid", ["upright", "rotated"])
+@pytest.mark.parametrize("order", ["RGBNA", "ARGB", "RGBAN"])
+def test_an_alpha_band_in_any_place_is_the_mask(tmp_path: Path, grid: str, order: str) -> None:
+    """With a near infrared band GDAL itself reports no mask; the collar is grey, so that no search finds it."""
+    rgb, alpha = picture(77), np.full((SIDE_PX, SIDE_PX), 255, np.uint8)
+    alpha[:COLLAR_PX] = 0
+    bands = {"R": rgb[0], "G": rgb[1], "B": rgb[2], "N": rgb[0], "A": alpha}
+    names = {"R": RGBA[0], "G": RGBA[1], "B": RGBA[2], "N": ColorInterp.undefined, "A": RGBA[3]}
+    path = written(tmp_path / "i.tif", np.stack([bands[b] for b in order]), grid, colorinterp=[names[b] for b in order])
+    built_without_its_collar(path, grid, tmp_path)
+
+
 @pytest.mark.parametrize("grid", ["upright", "degrees", "rotated"])
 @pytest.mark.parametrize("nodata", ["-99", "nan", "256", "0.5"])
 def test_nodata_that_8_bits_cannot_hold_is_ignored_with_a_word(tmp_path: Path, grid: str, nodata: str) -> None:

@@ -111,6 +111,10 @@ def test_version_120_has_no_home_row(tmp_path: Path) -> None:
 def test_comments_and_encodings_do_not_matter(tmp_path: Path, encoding: str) -> None:
     mission = course(tmp_path, "# Flugplätze", HOME, "", FIRST + " # über Grund", LAST, encoding=encoding)
     assert len(mission.items) == 2
+    path = tmp_path / "m.waypoints"
+    rows = path.read_bytes().decode(encoding)
+    path.write_bytes(f"# Flugplätze\r\n\r\n{rows}".encode(encoding))  # in front of the line that names the format
+    assert read_mission(path, course_only=True) == mission
 
 
 def test_a_jump_adds_its_leg_back(tmp_path: Path) -> None:

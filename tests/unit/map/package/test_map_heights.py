@@ -44,13 +44,24 @@ def test_egm2008_heights_are_converted_when_both_grids_exist(tmp_path: Path, mon
         assert np.nanmax(np.abs(file.read(1)[50:] - HEIGHT_M[0, 50:] - 0.7)) < 0.002
 
 
+def test_ellipsoidal_heights_take_the_other_geoid_where_only_it_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(heights.GRIDS, Datum.EGM96, "no_such_grid.tif")
+    monkeypatch.setitem(heights.GRIDS, Datum.EGM2008, str(write_geoid(tmp_path / "egm08.gtx")))
+    used, note = to_amsl(write_dem(tmp_path / "dem.tif"), Datum.ELLIPSOID, tmp_path / "out.tif")
+    with rasterio.open(used) as file:
+        assert file.read(1)[100, 150] == pytest.approx(HEIGHT_M[0, 100, 150] - undulation_m(150, 100), abs=0.002)
+    assert "converted from ellipsoid to EGM2008, used as AMSL: PROJ lacks the grid no_such_grid.tif" in note
+
+
 def test_missing_geoid_grids_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(heights.GRIDS, Datum.EGM96, "no_such_grid.tif")
     monkeypatch.setitem(heights.GRIDS, Datum.EGM2008, "no_such_grid.tif")
     dem = write_dem(tmp_path / "dem.tif")
     assert to_amsl(dem, Datum.EGM96, tmp_path / "o.tif") == (dem, "heights above EGM96, as given")
     used, note = to_amsl(dem, Datum.EGM2008, tmp_path / "o.tif")
-    assert used == dem and "not installed" in note
+    assert used == dem and "lacks the grid no_such_grid.tif, no_such_grid.tif (pyproj sync --file no_such_grid" in note
     with pytest.raises(UsageError, match=r"count from the ellipsoid .*pyproj sync"):
         to_amsl(dem, Datum.ELLIPSOID, tmp_path / "o.tif")
     (tmp_path / "bad.gtx").write_bytes(b"nothing")

@@ -12,7 +12,7 @@ import map_rasters
 from map_packages import alter, bound
 from terrafix.core.errors import MapError, UsageError
 from terrafix.map.format import MANIFEST_TABLE
-from terrafix.map.null_model import VERSION, null_row_for
+from terrafix.map.null_model import SCORE_VERSION, null_row_for
 from terrafix.map.package import MapPackage
 from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mapping.cli import app
@@ -41,7 +41,7 @@ def measured(image: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_package_stores_its_null_model(measured: Path) -> None:
     opened = MapPackage.open(measured, verify=True)  # checksum and file digest include it
     model = opened.layer().null_model
-    assert model is not None and (model.version, model.matcher) == (VERSION, "gradient")
+    assert model is not None and (model.version, model.matcher) == (SCORE_VERSION, "gradient")
     row = null_row_for(model, "gradient", 2.0 * AGL_M)
     assert row is model.rows[0] and row.agl_m == AGL_M
     assert row.places > 100.0  # 12 by 12 neighbours, at several headings and heights

@@ -18,6 +18,7 @@ from terrafix_lab.accept.measuring.map_distortion import left_by_local_model, me
 from terrafix_lab.accept.measuring.results import Measured, Verdict
 from terrafix_lab.faults.edits import Span
 
+MAP_FLOOR_PX = 2.5  # AC-10
 NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
 MIN_PATH_M = 100.0  # a relative drift over a shorter path has no meaning
 UNKNOWN_M, REQUEST_FRAMES, REQUEST_S = 100.0, 3, 2.0  # AC-6: 1-sigma of an unknown position, for so long
@@ -168,7 +169,8 @@ def map_px(e: Evidence) -> Measured:
     """Mean over the matched points of accepted fixes, projected with the published pose; pixels of the frames.
 
     Where the matches of other frames show the map's local distortion, it is taken out: ``shows_distortion`` is the
-    rule. Without it the number is that of the points as they are. The reason has both numbers and says which one."""
+    rule. Else the number is that of the points as they are, and not decidable if only the floor lies between both. The
+    reason has both numbers and says which one."""
     found = []
     for frame in e.frames:
         match = None if frame.match is None else solved(frame.match)
@@ -181,7 +183,10 @@ def map_px(e: Evidence) -> Measured:
     why = f"pixels of the stored frames; {whole_px:.1f} px with the map's local distortion, {left_px:.1f} px without"
     if shows_distortion(found):
         return Measured(left_px, f"{why}: judged without, other frames have matched the same ground")
-    return Measured(whole_px, f"{why}: judged with, too few frames have matched the same ground")
+    why += ": too few frames have matched the same ground"
+    if left_px <= MAP_FLOOR_PX < whole_px:
+        return Measured(whole_px, f"{why} to tell the map's error from that of the matches", Verdict.NOT_MEASURABLE)
+    return Measured(whole_px, f"{why}, judged with")
 
 
 def drift(e: Evidence) -> Measured:

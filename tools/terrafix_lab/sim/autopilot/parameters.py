@@ -3,6 +3,7 @@
 from enum import StrEnum
 
 from terrafix.core.errors import UsageError
+from terrafix_tools.preflight.simulated import FIRMWARE
 
 
 class Kind(StrEnum):
@@ -19,27 +20,6 @@ class Gps(StrEnum):
     ALONE = "alone"  # Terrafix is the only GPS (plane.param, copter.param)
 
 
-FIRMWARE = {  # defaults of ArduPilot 4.6
-    "AHRS_OPTIONS": 0.0,  # bit 0: no fall-back to DCM in a fixed wing
-    "ARMING_CHECK": 1.0,  # bit 0 all, bit 3 GPS
-    "ARSPD_USE": 1.0,
-    "EK3_CHECK_SCALE": 100.0,  # per cent of the limits below
-    "EK3_GPS_CHECK": 31.0,  # bits: satellites, HDOP, speed accuracy, position accuracy, yaw
-    "EK3_SRC1_POSXY": 3.0,  # 0 none, 3 GPS
-    "EK3_SRC1_VELXY": 3.0,
-    "EK3_SRC1_POSZ": 1.0,
-    "EK3_SRC1_VELZ": 3.0,
-    "EK3_SRC2_POSXY": 0.0,
-    "EK3_SRC2_VELXY": 0.0,
-    "EK3_SRC3_POSXY": 0.0,
-    "EK3_SRC3_VELXY": 0.0,
-    "GPS1_TYPE": 1.0,
-    "GPS1_DELAY_MS": 0.0,
-    "GPS2_TYPE": 0.0,
-    "GPS2_DELAY_MS": 0.0,
-    "GPS_AUTO_SWITCH": 1.0,  # 0 the primary alone, 1 the best, 2 blend, 4 the primary if it has a 3D fix
-    "GPS_PRIMARY": 0.0,
-}
 PLANE_DEFAULTS = {"EK3_CHECK_SCALE": 150.0}  # defaults that differ in a plane
 
 # config/vehicles, as recommended in docs/link.md; a test compares with the files.

@@ -10,6 +10,7 @@ import select
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -54,6 +55,8 @@ class AutopilotPeer:
         self._landed = False
         self._reboots = False
         self.muted = False  # receives and sends nothing, as with the cable unplugged
+        self.again_after_s: float | None = None  # all that it sends comes a second time, so much later
+        self._again: deque[tuple[float, bytes]] = deque()  # when, and what
         self.received_s: list[float] = []  # monotonic time of each GPS_INPUT
 
     def start(
@@ -101,6 +104,10 @@ class AutopilotPeer:
     def fixes(self) -> list[ReceivedFix]:
         """The 3D fixes of GPS_INPUT so far, ``received_s`` on the monotonic clock; callable from any thread."""
         return [replace(fix, received_s=fix.received_s + self._started_s) for fix in list(self._monitor.fixes)]
+
+    def texts(self) -> list[tuple[float, str]]:
+        """(time on the monotonic clock, text) of each STATUSTEXT so far; callable from any thread."""
+        return [(t_s + self._started_s, text) for t_s, text in list(self._autopilot.wire.received.texts)]
 
     def inject(self, data: bytes) -> None:
         """Sends bytes of another origin on the same line; callable from any thread."""
@@ -191,8 +198,16 @@ class AutopilotPeer:
             self.received_s += [time.monotonic()] * (self._autopilot.counts.received - before)
 
     def _send(self) -> None:
-        packets = self._autopilot.transmit()
-        if not packets or self._companion is None or self.muted:
+        packets, now_s = self._autopilot.transmit(), self._now_s()
+        if packets and self.again_after_s is not None:
+            self._again.append((now_s + self.again_after_s, packets))
+        while self._again and self._again[0][0] <= now_s:
+            self._send_packets(self._again.popleft()[1])
+        if packets:
+            self._send_packets(packets)
+
+    def _send_packets(self, packets: bytes) -> None:
+        if self._companion is None or self.muted:
             return
         try:
             self._socket.sendto(packets, self._companion)

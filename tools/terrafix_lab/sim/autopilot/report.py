@@ -155,7 +155,7 @@ class PeerMonitor:
             timesync_answers=traffic.timesync_answers,
             timesync_requests=traffic.timesync_requests,
             bad_packets=traffic.bad_packets,
-            status_texts=traffic.texts,
+            status_texts=[text for _, text in traffic.texts],
             autopilot_texts=[f"{t_s:.1f} s: {text}" for t_s, text in autopilot.wire.sent_texts],
         )
 

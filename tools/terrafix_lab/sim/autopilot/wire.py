@@ -39,7 +39,7 @@ class CompanionTraffic:
     timesync_requests: int = 0
     timesync_answers: int = 0  # to our own requests
     bad_packets: int = 0
-    texts: list[str] = field(default_factory=list)
+    texts: list[tuple[float, str]] = field(default_factory=list)  # (seconds of the flight, text)
 
 
 class Wire:
@@ -67,7 +67,7 @@ class Wire:
                 case "HEARTBEAT":
                     self.received.heartbeats += 1
                 case "STATUSTEXT":
-                    self.received.texts.append(packet.text)
+                    self.received.texts.append((now_s, packet.text))
                 case "TIMESYNC" if packet.tc1 == 0:
                     self.received.timesync_requests += 1
                     self.send(mavlink.MAVLink_timesync_message(self._boot_ns(now_s), packet.ts1))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
 from terrafix.core.errors import EvaluationError, SourceError, UsageError
 from terrafix_lab.sim.autopilot.parameters import Gps
@@ -17,6 +17,7 @@ from terrafix_lab.sim.out_folder import prepare_folder
 from terrafix_lab.sim.sensors.gnss_events import AnyEvent, Drag, Jam
 from terrafix_tools.evaluate import evaluate
 from terrafix_tools.mission.file import read_mission
+from terrafix_tools.progress import LineProgress, waiting
 from terrafix_tools.report.page import report
 
 MARKER_FILE = "fly.json"  # a folder that contains this file may be emptied
@@ -51,7 +52,7 @@ def run(request: Request, out: Path) -> int:
     conditions = Conditions(events=_events(request))
     mission = None if wanted.mission is None else read_mission(wanted.mission)
     console = Console()
-    with console.status("generating the ground"):
+    with waiting(console, "generating the ground"):
         scene, place = scene_of(wanted)
     package = out / "map.gpkg"
     plan = plan_over(
@@ -68,7 +69,7 @@ def run(request: Request, out: Path) -> int:
         conditions=conditions,
     )
     prepare_folder(out, MARKER_FILE, {"seed": wanted.seed, "vehicle": wanted.vehicle.value, "gps": request.gps.value})
-    with console.status("writing the map"):
+    with waiting(console, "writing the map"):
         write_map(package, wanted, place)
     return _report_result(_fly(plan, out, console), package, out, console)
 
@@ -85,7 +86,7 @@ def _events(request: Request) -> tuple[AnyEvent, ...]:
 
 def _fly(plan: LoopPlan, out: Path, console: Console) -> Flown:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} s of the flight"))
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
+    with LineProgress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task(plan.name, total=None)
         return fly(plan, out, progress=lambda t_s: progress.update(task, completed=t_s))
 

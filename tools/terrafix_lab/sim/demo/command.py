@@ -11,7 +11,7 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
 from terrafix.core.errors import EvaluationError, SourceError, UsageError
 from terrafix_lab.sim.autopilot.verdict import gps_input_failure, key_figures
@@ -21,6 +21,7 @@ from terrafix_lab.sim.flights.folder import FRAME_HZ, Flight, add_telemetry, pla
 from terrafix_lab.sim.out_folder import prepare_folder, write_json
 from terrafix_lab.sim.world import place as world
 from terrafix_lab.sim.world.mapped import CAMERA_SEASON, write_map
+from terrafix_tools.progress import LineProgress, waiting
 from terrafix_tools.report.gather import gather
 from terrafix_tools.report.page import report
 
@@ -81,7 +82,7 @@ def _fly_and_report(out: Path, seed: int, duration_s: float, console: Console, b
         return exit_code
     shutil.copyfile(generated.folder / "truth.csv", out / "truth.csv")
     add_telemetry(generated.folder, generated.flight)  # after the flight, in which telemetry came over MAVLink
-    with console.status("writing the report"):
+    with waiting(console, "writing the report"):
         try:
             evaluation = gather(out, out / "truth.csv").evaluation or {}
             page = report(out, out / "truth.csv", generated.map_path)
@@ -102,13 +103,13 @@ def _fly_and_report(out: Path, seed: int, duration_s: float, console: Console, b
 def generate(out: Path, seed: int, duration_s: float, console: Console, frame_hz: float = FRAME_HZ) -> Generated:
     """Writes map.gpkg and flight/ into ``out``. Raises OutputError."""
     map_path, folder = out / "map.gpkg", out / "flight"
-    with console.status("generating a place and its summer map"):
+    with waiting(console, "generating a place and its summer map"):
         place = world.generate(seed)
         write_map(place, map_path)
-    with console.status("rendering the place in autumn for the camera"):
+    with waiting(console, "rendering the place in autumn for the camera"):
         flight = plan_flight(place, place.render(CAMERA_SEASON), duration_s, frame_hz)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
+    with LineProgress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task("the camera", total=len(flight.frame_times_s()))
         write_flight(
             folder,

@@ -11,11 +11,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from msgspec import UnsetType
 
 from terrafix import messages as m
 from terrafix.core.camera import Mount
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix.core.geodesy import LocalFrame
+from terrafix.core.geodesy import LocalFrame, euler_from_rot
+from terrafix.core.mavlink.gimbal import quat_from_euler
+from terrafix.estimator.measurements.gimbal import LOOKING_ALONG_X
+from terrafix.messages import Quat
 from terrafix.vision.sources.description import (
     CameraTable,
     Description,
@@ -25,6 +29,7 @@ from terrafix.vision.sources.description import (
 )
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.autopilot.parameters import Kind
+from terrafix_lab.sim.camera.mount import CameraMount, Fixed, Gimbal
 from terrafix_lab.sim.camera.render import Film, Ground, Renderer
 from terrafix_lab.sim.flights.log import T0_US, TelemetryLog
 from terrafix_lab.sim.flights.path import FlownPath, fly
@@ -45,6 +50,7 @@ CAMERA = m.Camera(
     width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, focal_sigma=0.01, mount_tolerance_deg=1.0
 )
 FRAME_HZ = 2.0
+GIMBAL_S = 0.2  # between two reports [spec: STREAMS_HZ]
 JPEG_QUALITY = 92
 AGL_M = 130.0
 EDGE_MARGIN_PER_AGL = 1.3  # distance of the course from the edge of the image, in heights: the camera's reach
@@ -80,9 +86,23 @@ class Flight:
         """Exposure times, from zero."""
         return np.arange(math.floor(self.duration_s * self.frame_hz + 1e-6)) / self.frame_hz
 
+    @property
+    def mount(self) -> CameraMount:
+        """Fixed to the vehicle, or a gimbal, as the description of the camera says."""
+        kind = Fixed if isinstance(self.camera.gimbal, UnsetType) else Gimbal
+        return kind(Mount.of(self.camera))
+
     def camera_pose(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Returns p_c_in_w_m (3,) and R_w_c (3, 3)."""
-        return state.p_b_in_w_m, state.r_w_b() @ Mount.of(self.camera).r_b_c()
+        return state.p_b_in_w_m, self.mount.r_w_c(state)
+
+    def gimbal_attitudes(self) -> list[tuple[float, Quat]]:
+        """Time and attitude of each report of the gimbal; empty where the camera is fixed."""
+        if isinstance(self.camera.gimbal, UnsetType):
+            return []
+        times_s, mount = np.arange(0.0, self.duration_s, GIMBAL_S), self.mount
+        held = ((t_s, mount.r_w_c(self.path.state(t_s)) @ LOOKING_ALONG_X) for t_s in times_s.tolist())
+        return [(t_s, quat_from_euler(*euler_from_rot(r_w_g))) for t_s, r_w_g in held]
 
 
 def plan_flight(place: World, camera_image_bgr: np.ndarray, duration_s: float, frame_hz: float = FRAME_HZ) -> Flight:
@@ -164,7 +184,8 @@ def write_flight(
 
     ``map_name`` is relative to the folder. Raises OutputError.
     """
-    renderer = Renderer(flight.ground, flight.camera, film=Film(), seed=seed)
+    film = Film(readout_s=flight.camera.readout_s or 0.0)
+    renderer = Renderer(flight.ground, flight.camera, film=film, seed=seed)
     times = flight.frame_times_s()
     frame_rows, truth = [], []
     try:
@@ -172,7 +193,10 @@ def write_flight(
         for i, t_s in enumerate(times.tolist()):
             state = flight.path.state(t_s)
             name = f"{i + 1:04d}.jpg"
-            _write_jpeg(folder / "frames" / name, renderer.frame(*flight.camera_pose(state), i))
+            _write_jpeg(
+                folder / "frames" / name,
+                renderer.frame(*flight.camera_pose(state), i, motion=flight.mount.motion(state)),
+            )
             frame_rows.append([name, f"{t_s:.3f}"])
             truth.append([name, *truth_row(flight.frame, state)])
             if progress:
@@ -188,7 +212,7 @@ def write_flight(
 
 def add_telemetry(folder: Path, flight: Flight) -> None:
     """Writes telemetry.tlog into the folder. Raises OutputError."""
-    flight.telemetry.write(folder / "telemetry.tlog")
+    flight.telemetry.write(folder / "telemetry.tlog", flight.gimbal_attitudes())
 
 
 def truth_row(frame: LocalFrame, state: State) -> list[str]:

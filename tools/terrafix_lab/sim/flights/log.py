@@ -1,11 +1,14 @@
 """telemetry.tlog of a simulated flight: the autopilot's packets as a ground station records them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import OutputError
+from terrafix.core.mavlink.gimbal import IN_EARTH, YAW_LOCK
 from terrafix.core.mavlink.tlog import record
+from terrafix.messages import Quat
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.interfaces import Readings
 
@@ -30,7 +33,7 @@ class TelemetryLog:
     def __init__(self, autopilot: SimAutopilot, t0_us: int) -> None:
         """``t0_us``: UNIX time of the flight's zero, in microseconds."""
         self._autopilot, self._t0_us = autopilot, t0_us
-        self._records: list[bytes] = []
+        self._records: list[tuple[int, bytes]] = []
         sender = mavlink.MAVLink(None, srcSystem=255, srcComponent=COMPANION)
         for message_id, rate_hz in RATES_HZ.items():
             request = mavlink.MAVLink_command_long_message(
@@ -42,11 +45,16 @@ class TelemetryLog:
         self._autopilot.step(readings.t_s, readings)
         packets = self._autopilot.transmit()
         if packets:
-            self._records.append(record(self._t0_us + round(readings.t_s * 1e6), packets))
+            self._records.append((self._t0_us + round(readings.t_s * 1e6), packets))
 
-    def write(self, path: Path) -> None:
-        """Writes the file. Raises OutputError."""
+    def write(self, path: Path, gimbal: Sequence[tuple[float, Quat]] = ()) -> None:
+        """Writes the file. ``gimbal``: seconds, and attitude of the camera in north, east, down. Raises OutputError."""
+        sender, flags, still = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), YAW_LOCK | IN_EARTH, (0.0,) * 3
+        records = list(self._records)
+        for t_s, q in gimbal:
+            status = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, round(1e3 * t_s), flags, q, *still, 0)
+            records.append((self._t0_us + round(t_s * 1e6), bytes(status.pack(sender))))
         try:
-            path.write_bytes(b"".join(self._records))
+            path.write_bytes(b"".join(record(*one) for one in sorted(records)))
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another --out") from None

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
 from terrafix.core.errors import OutputError, UsageError
 from terrafix.vision.sources.description import camera_of, read_description
@@ -26,6 +26,7 @@ from terrafix_lab.sim.world import place as world
 from terrafix_lab.sim.world.map_content import MapContent
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mission.file import read_mission, write_mission
+from terrafix_tools.progress import LineProgress, waiting
 
 AGL_LIMITS_M = (30.0, 1500.0)
 MAP_NAME = "map.gpkg"
@@ -61,7 +62,7 @@ def make(out: Path, wanted: FlightOptions, *, progress: bool = True) -> Flight:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise OutputError(f"{out}: exists and is not an empty folder; choose another --out")
     console = Console(stderr=True, quiet=not progress)
-    with console.status("generating the ground"):
+    with waiting(console, "generating the ground"):
         scene, place = scene_of(wanted)
     if mission is None:
         length_m = 1e3 * wanted.length_km if wanted.length_km is not None else 30.0 * (wanted.duration_s or 200.0)
@@ -73,7 +74,7 @@ def make(out: Path, wanted: FlightOptions, *, progress: bool = True) -> Flight:
             agl_m=wanted.agl_m,
             from_ground=wanted.from_ground,
         )
-    with console.status("simulating the flight"):
+    with waiting(console, "simulating the flight"):
         flight = flight_over(
             scene, wanted.vehicle, seed=wanted.seed, mission=mission, duration_s=wanted.duration_s, events=events
         )
@@ -82,11 +83,11 @@ def make(out: Path, wanted: FlightOptions, *, progress: bool = True) -> Flight:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-    with console.status("writing the map"):
+    with waiting(console, "writing the map"):
         write_map(out / MAP_NAME, wanted, place)
     write_mission(out / "mission.waypoints", mission)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
+    with LineProgress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
         task = bar.add_task("the camera", total=len(flight.frame_times_s()))
         write_flight(out, flight, MAP_NAME, seed=wanted.seed, progress=lambda done, _: bar.update(task, completed=done))
     return flight

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from terrafix.core.flight_id import frame_uid
 from terrafix.core.gate import CHI2_95
 from terrafix.core.log_lines import SEARCHING_STEPS
 from terrafix.link.ground_station.prior_request import MIN_FRAMES
@@ -92,7 +93,7 @@ class FlightObserver:
         self._image_url = image_url
         self.estimates: dict[int, NavEstimate] = {}  # the last one of each frame
         self.hints: dict[int, int] = {}  # id of each hint that was given, by its t_ns
-        self.origin_ns = 0
+        self.origin_ns, self.flight_id = 0, ""
         self._fragments: dict[int, Fragment] = {}
         self._state = FlightState.PROCESSING
         self._asked = False
@@ -122,7 +123,7 @@ class FlightObserver:
         for message in messages:
             match message:
                 case Origin():
-                    self.origin_ns = message.t_ns
+                    self.origin_ns, self.flight_id = message.t_ns, message.flight_id
                 case Frame():
                     self._shown, self._match = message, None
                     self._frame_of[message.file], self._file_of[message.frame_id] = message.frame_id, message.file
@@ -149,6 +150,7 @@ class FlightObserver:
         assert shown is not None
         estimate, found = self.estimates.get(shown.frame_id), self._match
         result = _result(shown, estimate, found, self.origin_ns)
+        result.frame_uid = frame_uid(self.flight_id, shown.frame_id)
         events: list[Event] = [FrameProcessed(**result.model_dump())]
         fragment = None
         if estimate is not None and estimate.fragment_id >= 0:
@@ -184,7 +186,9 @@ class FlightObserver:
     def _refined_frame(self, pose: RefinedPose, source: str) -> FrameRefined:
         if pose.m_per_unit is not None:
             self._scales[pose.frame_id] = pose.m_per_unit
-        return _refined(pose, source, self._scales.get(pose.frame_id))
+        refined = _refined(pose, source, self._scales.get(pose.frame_id))
+        refined.frame_uid = frame_uid(self.flight_id, pose.frame_id)
+        return refined
 
     def completed(self, verdict: WholeVerdict | None = None, not_finalised: str = "") -> FlightCompleted:
         """``verdict``: on the flight, None: it has no record; ``not_finalised``: why it has no solution as a whole."""

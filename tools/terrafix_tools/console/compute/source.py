@@ -61,7 +61,8 @@ class UploadedImages:
             self.new = NewFlight.model_validate_json(flights.row_of(db, flight_id).spec)
             states = [self._state(image) for image in flights.images_of(db, flight_id, 0, 1)]
         by_photos = any(state is not None and state.source == "exif" for state in states)
-        self._origin = origin(self.new, STATED_TILT_SIGMA_DEG if by_photos else ATTITUDE_SIGMA_DEG)
+        stated = origin(self.new, STATED_TILT_SIGMA_DEG if by_photos else ATTITUDE_SIGMA_DEG)
+        self._origin = msgspec.structs.replace(stated, flight_id=flight_id)
         self.stored = stored_camera(self.new)
 
     def origin(self) -> Origin:

@@ -2,7 +2,7 @@
 
 import json
 import re
-import secrets
+import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -67,7 +67,7 @@ def order_of(name: str) -> tuple[list[str | int], str]:
 
 def create(db: sa.Connection, new: NewFlight) -> Flight:
     """A new flight; its map is made if it has an area."""
-    flight_id = secrets.token_hex(8)
+    flight_id = str(uuid.uuid4())
     row = {
         "id": flight_id,
         "name": new.name or flight_id,

@@ -46,13 +46,18 @@ def kml_shapes(path: Path, data: bytes) -> tuple[list[Shape], tuple[str, ...]]:
             shapes.append((False, kind, _points(where, " ".join(coords))))
         elif kind == "Point":
             places.append(_points(f"{path} Point {len(places) + 1}", _coordinates(element)))
+    links = [link for link in root.iter() if _kind(link) == "NetworkLink"]
+    if links and not shapes and not places:
+        href = " ".join((links[0].findtext(".//{*}href") or "another document").split())
+        raise UsageError(f"{path}: has no shape of its own, only a link to {href}; save what it shows as KML")
     count = sum(len(place) for place in places)
+    notes = (f"{len(links)} link(s) to other documents are not followed",) if links else ()
     if shapes and count:
-        return shapes, (f"{count} point(s) beside the outlines are left out",)
+        return shapes, (*notes, f"{count} point(s) beside the outlines are left out")
     if count > 1:
         text = f"its {count} points are read as way points, in their order"
-        return [(False, "Points", np.concatenate(places))], (text,)
-    return shapes, ()
+        return [(False, "Points", np.concatenate(places))], (*notes, text)
+    return shapes, notes
 
 
 def _kind(element: ElementTree.Element) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import MIN_SIDE_CELLS, FrameMatcher
 from terrafix.anchor.relocalization.coarse_descriptors import has_stored_scale
-from terrafix.anchor.relocalization.map_search import CELL_PER_AGL
+from terrafix.anchor.relocalization.map_search import POOLED_CELL_PER_AGL
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Map
 from terrafix.core.errors import UsageError
@@ -226,7 +226,7 @@ def _warnings(layer: Layer, frame_cells: int, has_elevation: bool, cell_m: float
 
 def _search_warnings(local: LocalMap, matcher: FrameMatcher, agl_m: float) -> list[str]:
     """Warnings about the computation that a search of the whole map needs in flight."""
-    wanted_m = matcher.cell_m(agl_m, CELL_PER_AGL / PooledGradientDescriber.stride)
+    wanted_m = matcher.cell_m(agl_m, POOLED_CELL_PER_AGL / PooledGradientDescriber.stride)
     if has_stored_scale(local, PooledGradientDescriber.name, wanted_m):
         return []
     e_min, n_min, e_max, n_max = local.bounds_m

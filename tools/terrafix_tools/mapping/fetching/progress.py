@@ -5,7 +5,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+from terrafix_tools.progress import LineProgress
 
 
 @dataclass
@@ -36,7 +38,7 @@ def shown(say: Console, title: str) -> Iterator[OnProgress]:
         TextColumn("{task.fields[size]}"),
         TimeRemainingColumn(elapsed_when_finished=True),
     )
-    with Progress(*columns, console=say, disable=not say.is_terminal) as progress:
+    with LineProgress(*columns, console=say) as progress:
         task = progress.add_task(title, total=None, size="")
 
         def draw(state: DownloadProgress) -> None:
@@ -51,7 +53,7 @@ def shown(say: Console, title: str) -> Iterator[OnProgress]:
 def steps_display(say: Console) -> Iterator[Callable[[str, int | None], Callable[[], None]]]:
     """Yields a function (name, steps or None) -> step(), for the collar search."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=say, disable=not say.is_terminal) as progress:
+    with LineProgress(*columns, console=say) as progress:
 
         def start(name: str, total: int | None) -> Callable[[], None]:
             task = progress.add_task(name, total=total)

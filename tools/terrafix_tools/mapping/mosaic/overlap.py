@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafix.anchor.matching.orthorectify import Rectified
-from terrafix.anchor.matching.patch_matcher import match_patches
+from terrafix.anchor.matching.patch_matcher import SearchedMap, match_patches
 from terrafix.map.package import LocalMap
 from terrafix_engines.features.gradient import GradientDescriber
 
@@ -93,7 +93,6 @@ def _patch(
     ground, valid = second.window(*corner_m, side, side, cell_m)
     describe = GradientDescriber().describe
     template = Rectified(picture, mask, *at_m, cell_m)
-    found = match_patches(
-        describe(picture), template, mask, cell_m, describe(ground), valid, corner_m, (0.0, 0.0), PATCH_CELLS, reach
-    )
+    searched = SearchedMap(describe(ground), valid, corner_m)
+    found = match_patches(describe(picture), template, mask, cell_m, searched, (0.0, 0.0), PATCH_CELLS, reach)
     yield from found.map_m - found.frame_m

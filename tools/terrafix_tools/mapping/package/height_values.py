@@ -23,6 +23,7 @@ from terrafix_tools.mapping.ways import accuracy_to_wgs84
 US_FOOT, FOOT, METRE = "US survey foot", "foot", "metre"
 SHORT = {  # letters of a unit as programs write it -> its name in PROJ's database
     "m": METRE, "meter": METRE, "ft": FOOT, "feet": FOOT, "international foot": FOOT, "international feet": FOOT,
+    "foot international": FOOT, "foot intl": FOOT, "ft intl": FOOT,
     "us ft": US_FOOT, "ft us": US_FOOT, "ftus": US_FOOT, "usft": US_FOOT, "foot us": US_FOOT, "feet us": US_FOOT,
     "us foot": US_FOOT, "us feet": US_FOOT, "us survey feet": US_FOOT, "survey foot": US_FOOT, "survey feet": US_FOOT,
     "us survey ft": US_FOOT, "sft": US_FOOT, "cm": "centimetre", "centimeter": "centimetre", "mm": "millimetre",
@@ -30,6 +31,8 @@ SHORT = {  # letters of a unit as programs write it -> its name in PROJ's databa
 }  # fmt: skip
 DECIMETRES = {"dm", "decimetre", "decimeter"}  # PROJ's database (9.5) gives a decimeter 0.01 m
 OF_UNIT = {Unit.METRE: METRE, Unit.FOOT: FOOT, Unit.US_FOOT: US_FOOT}
+# Of a vertical system that is named as its ellipsoid or geodetic datum, as Esri's are, the heights count from it.
+ELLIPSOIDAL = re.compile(r"ellips|^d?(wgs|grs|itrf|etrs)\d|^d?nad(19)?83")
 SAME = 1e-5  # relative: a foot and a US survey foot are one to a height
 
 
@@ -139,8 +142,11 @@ def _lengths() -> dict[str, float]:
 
 def _metres(unit: str) -> float | None:
     """Length of a unit by its name or abbreviation; None: not known."""
-    letters = " ".join(re.findall(r"[a-z]+", unit.lower()))
-    for name in (unit.strip().lower(), letters, letters.removesuffix("s")):
+    names = [unit.strip().lower()]
+    if not re.search(r"\d", unit):  # "0.1 m" and "1/100 ft" are no names of units
+        letters = " ".join(re.findall(r"[a-z]+", unit.lower().replace(".", "")))
+        names += [letters, letters.removesuffix("s")]
+    for name in names:
         if name in DECIMETRES:
             return 0.1
         if (found := _lengths().get(SHORT.get(name, name).lower())) is not None:
@@ -163,7 +169,7 @@ def _datum(crs: CRS | None, vertical: CRS | None) -> tuple[Datum | None, str]:
         return Datum.EGM96, vertical.name
     if "egm2008" in name or "egm08" in name:
         return Datum.EGM2008, vertical.name
-    if "ellipsoid" in name:
+    if ELLIPSOIDAL.search(name):
         return Datum.ELLIPSOID, vertical.name
     if name in ("", "unknown", "unnamed"):
         return Datum.EGM96, ""

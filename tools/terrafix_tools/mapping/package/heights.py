@@ -21,7 +21,7 @@ from terrafix_tools.mapping.datum import crs_of, stated_crs
 from terrafix_tools.mapping.mosaic.warp import NODE_PX, spread
 from terrafix_tools.mapping.package.height_values import Heights, heights_of
 from terrafix_tools.mapping.source import open_raster
-from terrafix_tools.mapping.ways import lacking_grids, operations
+from terrafix_tools.mapping.ways import lacking_grids, lacking_text, operations
 
 BLOCK_PX = 1024
 WGS84_EGM96 = 9707  # EPSG: WGS 84 + EGM96 height
@@ -47,14 +47,17 @@ def to_amsl(
     if datum is None:
         return _from_national(dem, heights, out)
     below = _undulation(str(geoid) if geoid else GRIDS[Datum.EGM96])
-    above = _undulation(GRIDS[Datum.EGM2008]) if datum is Datum.EGM2008 else None
+    egm2008 = _undulation(GRIDS[Datum.EGM2008])
+    above = egm2008 if datum is Datum.EGM2008 else None
     if geoid and below is None:
         raise UsageError(f"{geoid}: not a grid of a geoid that PROJ reads (.gtx or .tif); check --geoid")
     if datum is Datum.EGM2008 and (below is None or above is None):
-        return (
-            dem,
-            "heights above EGM2008, used as AMSL: the grids of the geoids are not installed, usually under 1 m off",
-        )
+        grids = [GRIDS[one] for one, grid in ((Datum.EGM96, below), (Datum.EGM2008, above)) if grid is None]
+        return dem, f"heights above EGM2008, used as AMSL: {lacking_text(grids)}, usually under 1 m off"
+    if below is None and egm2008 is not None:
+        _convert(dem, heights, out, partial(_undulation_change_m, [egm2008]))
+        lacking = lacking_text([GRIDS[Datum.EGM96]])
+        return out, f"heights converted from {datum} to EGM2008, used as AMSL: {lacking}, usually under 1 m off"
     if below is None:
         raise UsageError(
             f"{dem}: its heights count from the ellipsoid and no grid of the geoid is installed; "

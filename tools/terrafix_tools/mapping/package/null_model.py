@@ -20,7 +20,7 @@ from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.node import Image
 from terrafix.map.format import Layer
-from terrafix.map.null_model import DEFAULT_NULL, VERSION, FalseAlarmBudget, NullModel, NullRow, Tail
+from terrafix.map.null_model import DEFAULT_NULL, SCORE_VERSION, FalseAlarmBudget, NullModel, NullRow, Tail
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.mapping.package.rewrite import rewrite_manifest
@@ -58,7 +58,7 @@ def add_null_models(package: Path, heights_m: Sequence[float]) -> None:
         west, south, east, north = opened.manifest.bounds_wgs84
         local = opened.bind(LocalFrame((south + north) / 2, (west + east) / 2))
         rows = tuple(fit_null_row(local, agl_m, FLIGHTS, STRETCHES) for agl_m in heights_m)
-        model = NullModel(version=VERSION, matcher=GradientDescriber.name, rows=rows)
+        model = NullModel(version=SCORE_VERSION, matcher=GradientDescriber.name, rows=rows)
         newest, *others = opened.manifest.layers
         layers: tuple[Layer, ...] = (msgspec.structs.replace(newest, null_model=model), *others)
         manifest = msgspec.structs.replace(opened.manifest, layers=layers)

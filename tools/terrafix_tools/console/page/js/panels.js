@@ -44,7 +44,9 @@ export class OverviewPanel {
     }
     const parts = flight.fragments.map((one) => [number(one.fragment_id), `${one.first_frame} – ${one.last_frame}`, number(one.frames),
       one.joined ? t("joined") : td("warn", t("not_joined"))]);
-    fill(this.figures, pairs(rows), h("h3", {}, t("fragments")), table([t("fragment"), t("frames"), t("count"), t("tie")], parts, t("none_yet")));
+    const source = model.facts?.source;
+    const said = source ? [h("h3", {}, t("source_said")), pairs(source.map((one) => [one.topic, one.text]))] : null;
+    fill(this.figures, pairs(rows), h("h3", {}, t("fragments")), table([t("fragment"), t("frames"), t("count"), t("tie")], parts, t("none_yet")), said);
   }
 }
 

@@ -50,7 +50,7 @@ const EN = {
   match_line: "map match: {0}{1}", inliers: " · {0} points agree", no_match: "no map match", locating: "The position of the pixel is being computed …",
   // tabs
   tab_overview: "Flight", tab_verdicts: "Verdicts", tab_vehicle: "Vehicle", tab_log: "Events", tab_objects: "Objects", tab_export: "Export",
-  images: "Images", frames_shown: "Frames with a result", start: "Start", no_start: "none given: the whole map is searched", live_start: "not given: by GNSS on the ground, or searched on the map", localised: "Localised", refined: "Refined",
+  images: "Images", frames_shown: "Frames with a result", start: "Start", no_start: "none given: the whole map is searched", source_said: "Source", live_start: "not given: by GNSS on the ground, or searched on the map", localised: "Localised", refined: "Refined",
   of: "{0} of {1}", median95: "Median 95 % radius", fragments: "Fragments", fragment: "No.", frames: "Frames", count: "Count", tie: "Tie", joined: "tied to the flight",
   not_joined: "not tied yet", none_yet: "None yet.", only_rejected: "Only rejected ones", measurement: "Measurement", verdict: "Verdict", ratio: "Test ratio", detail: "Detail",
   no_verdicts: "No verdicts yet.",
@@ -141,7 +141,7 @@ const DE = {
   next: "Nächstes Einzelbild", newest: "Neuestes", enlarge: "Groß oder klein", match_line: "Kartenabgleich: {0}{1}", inliers: " · {0} Punkte stimmen überein", no_match: "kein Kartenabgleich",
   locating: "Die Position des Bildpunkts wird berechnet …",
   tab_overview: "Flug", tab_verdicts: "Urteile", tab_vehicle: "Fahrzeug", tab_log: "Verlauf", tab_objects: "Objekte", tab_export: "Export",
-  images: "Bilder", frames_shown: "Einzelbilder mit Ergebnis", start: "Startpunkt", no_start: "nicht angegeben: die ganze Karte wird durchsucht", live_start: "nicht angegeben: über GNSS am Boden, oder auf der Karte gesucht", localised: "Lokalisiert",
+  images: "Bilder", frames_shown: "Einzelbilder mit Ergebnis", start: "Startpunkt", no_start: "nicht angegeben: die ganze Karte wird durchsucht", source_said: "Quelle", live_start: "nicht angegeben: über GNSS am Boden, oder auf der Karte gesucht", localised: "Lokalisiert",
   refined: "Nachträglich verfeinert", of: "{0} von {1}", median95: "Mittlerer 95-%-Radius", fragments: "Teilstücke", fragment: "Nr.", frames: "Einzelbilder", count: "Anzahl", tie: "Anbindung",
   joined: "mit dem Flug verbunden", not_joined: "noch nicht verbunden", none_yet: "Noch keine.", only_rejected: "Nur abgelehnte", measurement: "Messung", verdict: "Urteil",
   ratio: "Testgröße", detail: "Einzelheit", no_verdicts: "Noch keine Messurteile.",

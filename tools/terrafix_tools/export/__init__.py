@@ -1,0 +1,1 @@
+"""`terrafix log export`: a flight in the formats of other programs."""
