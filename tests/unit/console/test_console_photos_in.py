@@ -153,6 +153,7 @@ def test_a_zip_a_folder_and_a_flight_folder_give_the_same_photos_as_files(
 MANY = 1000
 
 
+@pytest.mark.nightly  # 45 s
 def test_a_thousand_photos_are_cancelled_warned_of_and_gone_on_with_after_a_reload(
     console: Console, window: Browser, tmp_path: Path
 ) -> None:
