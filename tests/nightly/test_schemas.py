@@ -4,12 +4,13 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import jsonschema_rs
 import pytest
 
 from broken_files import BROKEN
 from terrafix_tools.configuration.check import kind_of
 from terrafix_tools.configuration.schema import schemas
+
+jsonschema_rs = pytest.importorskip("jsonschema_rs", reason="needs the extra 'nightly'")
 
 ROOT = Path(__file__).resolve().parents[2]
 VALIDATORS = {kind: jsonschema_rs.validator_for(schema) for kind, schema in schemas().items()}

@@ -324,7 +324,8 @@ class EstimatorNode:
             yield camera_vehicle
         odometry = self._in_telemetry_time(odometry, time_offset)
         newest = self._estimator.last
-        if newest is not None and odometry.t_ns * 1e-9 < newest.t_s + STEP_S:  # by an offset that has jumped
+        offset = odometry.t_ns != stamped_ns
+        if offset and newest is not None and odometry.t_ns * 1e-9 < newest.t_s + STEP_S:  # it has jumped
             yield odometry_verdict(odometry, Verdict.STALE, "taken before the newest frame")
             return
         estimator, frame = self._frame_input(self._estimator, odometry)

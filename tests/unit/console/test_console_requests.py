@@ -27,6 +27,7 @@ from terrafix_tools.console.openapi import schema
 from terrafix_tools.console.settings import ServiceLimits
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import FILE
+from terrafix_tools.installation import install_command
 
 
 @pytest.fixture(scope="module")
@@ -346,7 +347,7 @@ def test_without_the_console_extra_one_line_states_what_to_install(tmp_path: Pat
     words = [sys.executable, "-c", code, "serve", "--data", str(tmp_path)]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
-    assert done.stderr == "terrafix: this command needs fastapi; install it: pip install 'terrafix[console]'\n"
+    assert done.stderr == f"terrafix: this command needs fastapi; install it: {install_command('console')}\n"
 
 
 def facts(console: Console, parts: list[tuple[str, str, bytes]]) -> Answer:

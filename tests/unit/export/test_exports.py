@@ -322,7 +322,7 @@ def test_another_reader_finds_names_positions_and_orientations(
 
 
 def test_every_format_is_read_by_a_test() -> None:
-    others = {"csv", "parquet", "kmz", "rosbag"}  # by tests of their own
+    others = {"csv", "parquet", "kmz", "rosbag", "waypoints"}  # by tests of their own
     assert set(READERS) | others == set(FORMATS)
 
 

@@ -25,6 +25,7 @@ from terrafix_tools.fleet.examine import Examiner
 from terrafix_tools.fleet.find import Place, find_records, open_place
 from terrafix_tools.fleet.query import query
 from terrafix_tools.fleet.store import LIST, FleetFolder, open_fleet
+from terrafix_tools.installation import install_command
 
 RECORDS = 12
 LIMIT = DEATHS + DEATHS_ALONE
@@ -395,4 +396,4 @@ def test_without_pyarrow_one_line_states_what_to_install(records: Path, tmp_path
     code = "import sys; sys.modules['pyarrow'] = None; from terrafix_tools.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *command[3:]], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "terrafix: this command needs pyarrow; install it: pip install 'terrafix[ground]'\n"
+    assert done.stderr == f"terrafix: this command needs pyarrow; install it: {install_command('ground')}\n"

@@ -39,7 +39,7 @@ def context(folder: Path, map_path: Path | None) -> NodeContext:
 def test_an_unknown_start_is_the_map_centre_with_the_size_of_the_map_as_sigma(tmp_path: Path) -> None:
     edge = make_edge(context(flight(tmp_path / "f", toml=NO_START), package(tmp_path / "map.gpkg")))
     try:
-        (origin,) = edge.poll(now_ns())
+        origin, _facts = edge.poll(now_ns())
         assert isinstance(origin, Origin)
         assert (origin.lat_deg, origin.lon_deg) == pytest.approx((48.015, 11.01))
         half_height_m = math.radians(0.015) * 6_371_000
