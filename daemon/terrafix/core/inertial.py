@@ -31,6 +31,12 @@ def rotate_to_world(v_b: Sequence[np.ndarray], yaw: np.ndarray, pitch: np.ndarra
     return np.column_stack([sy * ahead + cy * right, cy * ahead - sy * right, -down])
 
 
+def integrated(values: np.ndarray, s_s: np.ndarray) -> np.ndarray:
+    """Integral of ``values`` (N, ...) at ``s_s`` (N,) [s] from the first to each, linear between them: same shape."""
+    spans_s = np.diff(s_s).reshape(-1, *[1] * (values.ndim - 1))
+    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(0.5 * (values[1:] + values[:-1]) * spans_s, axis=0)])
+
+
 def trapezoid_weights(s_s: np.ndarray) -> np.ndarray:
     """(N,) [s]: weights with which values at ``s_s`` (N,) are summed to their integral, linear between them."""
     weight = np.zeros(len(s_s))

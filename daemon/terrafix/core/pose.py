@@ -50,6 +50,12 @@ def log_so3(r: np.ndarray) -> np.ndarray:
     return half * np.array([h - f, c - g, d - b])
 
 
+def small_turns(r_a: np.ndarray, r_b: np.ndarray) -> np.ndarray:
+    """(N, 3) rotation [rad] about the axes of the world from ``r_a`` (N, 3, 3) to ``r_b``, to second order."""
+    step = np.einsum("nij,nkj->nik", r_b, r_a)
+    return 0.5 * np.column_stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
+
+
 def project_with_jacobian(
     r_w_c: np.ndarray, p_c_in_w_m: np.ndarray, points_w_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,7 +16,8 @@ import numpy as np
 
 from terrafix.core.agreement import P_REJECTED
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
-from terrafix.core.pose import log_so3
+from terrafix.core.inertial import integrated
+from terrafix.core.pose import log_so3, small_turns
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.offset_drift import (
     DRIFT_GRID_S,
@@ -41,7 +42,7 @@ UNSTAMPED_SHARE = 0.01  # of cameras whose buffers or pipeline may delay by anyt
 OUTSIDE_S = 5.0  # s, 1-sigma of an offset at the end of the grid, or beyond it [spec: the width of the grid]
 # Hazard of a buffer that lies between exposure and stamp: one that begins to fill in 20 minutes of flight, one that
 # jumps in five hours; elsewhere a false alarm of the monitors.
-# [spec: FALSE_ALARM_HOURS, monitors/cusum.py, at a stamp of exposure; measured: docs/decisions/058]
+# [spec: MONITOR_FALSE_ALARM_HOURS, monitors/cusum.py, at a stamp of exposure; measured: docs/decisions/058]
 BUFFERED, STAMPED = Hazards(3.0 / 3600.0, 0.2 / 3600.0), Hazards(1.0 / 3.6e6, 1.0 / 3.6e6)
 # ns between two frames that are compared: as long as a gust turns a vehicle, longer than vibration and pixel noise.
 MIN_SPAN_NS = 900_000_000  # [measured: docs/decisions/058]
@@ -82,7 +83,7 @@ class Contradiction:
         mps = np.full(len(DRIFT_GRID_S), complex(*self.velocity_mps))
         if (varied := telemetry.velocities(self.t_ns, DRIFT_GRID_S)) is not None:
             mps += varied - np.interp(agreed_s, DRIFT_GRID_S, varied)
-        way_m = np.concatenate([[0.0], np.cumsum(0.5 * (mps[1:] + mps[:-1]) * np.diff(DRIFT_GRID_S))])
+        way_m = integrated(mps, DRIFT_GRID_S)
         way_m -= np.interp(agreed_s, DRIFT_GRID_S, way_m)
         return np.stack([way_m.real, way_m.imag])
 
@@ -335,7 +336,7 @@ class TimeOffset:
             return None
         turned_rad, moved_m = cameras[0] @ log_so3(motion.r), cameras[0] @ motion.p_m
         by_gyro = telemetry.turns_by_gyro(keyframe_ns, odometry.t_ns, DRIFT_GRID_S)
-        reported_rad = _rotations(bodies[0], bodies[1]) if by_gyro is None else by_gyro
+        reported_rad = small_turns(bodies[0], bodies[1]) if by_gyro is None else by_gyro
         apart_rad = turned_rad - reported_rad
         return _Registered(odometry.t_ns, complex(*moved_m[:2]), turned_rad, apart_rad, by_gyro is not None)
 
@@ -362,8 +363,8 @@ class TimeOffset:
     def _rate_log_likelihood(
         self, before: _Registered, now: _Registered, since_s: float, agl_m: float, telemetry: Telemetry
     ) -> np.ndarray:
-        """(R,) of the displacement that images show. Zero where nothing measures how the
-        vehicle's velocity changed."""
+        """(R,) of the displacement that images show. Zero where nothing measures how the vehicle's velocity
+        changed."""
         span_s, changes = (now.t_ns - before.t_ns) * 1e-9, None
         if since_s < MAX_VELOCITY_GAP_S:
             changes = telemetry.velocity_changes(before.t_ns, now.t_ns, DRIFT_GRID_S)
@@ -383,9 +384,3 @@ def _prior(sigma_s: float) -> np.ndarray:
     stamped = np.exp(-0.5 * (DRIFT_GRID_S / sigma_s) ** 2)
     mass[0] = (1.0 - UNSTAMPED_SHARE) * stamped / stamped.sum() + UNSTAMPED_SHARE / len(DRIFT_GRID_S)
     return mass
-
-
-def _rotations(r_a: np.ndarray, r_b: np.ndarray) -> np.ndarray:
-    """(N, 3) about east, north and up [rad] from R_w_b (N, 3, 3) to another, both of moderate distance."""
-    step = np.einsum("nij,nkj->nik", r_b, r_a)
-    return 0.5 * np.column_stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.core.geodesy import rot_w_b
-from terrafix.core.inertial import GRAVITY_MPS2, covers, rotate_to_world
-from terrafix.core.pose import log_so3
+from terrafix.core.inertial import GRAVITY_MPS2, covers, integrated, rotate_to_world
+from terrafix.core.pose import log_so3, small_turns
 from terrafix.estimator.measurements.gimbal import GimbalReports, euler_of
 from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.messages import Imu, VehicleState
@@ -236,8 +236,7 @@ class Telemetry:
         if world is None:
             return None
         accel_mps2 = world.accel_w_mps2[:, 0] + 1j * world.accel_w_mps2[:, 1]
-        mps = np.cumsum(0.5 * (accel_mps2[1:] + accel_mps2[:-1]) * np.diff(world.s_s))
-        return world.s_s, np.concatenate([[0.0], mps])
+        return world.s_s, integrated(accel_mps2, world.s_s)
 
     def turns_by_gyro(self, t0_ns: int, t1_ns: int, offset_s: np.ndarray) -> np.ndarray | None:
         """(N, 3): rotation of the vehicle about east, north and up [rad] from ``t0_ns`` to ``t1_ns``, both less each of
@@ -250,7 +249,7 @@ class Telemetry:
         (t_g, rates), (t_a, angles) = known
         rates_w = rotate_to_world([*rates], *(np.interp(t_g, t_a, angle) for angle in _unwrapped(angles)))
         s_s = (t_g - t_g[0]) * 1e-9
-        turned = np.vstack([np.zeros(3), np.cumsum(0.5 * (rates_w[1:] + rates_w[:-1]) * np.diff(s_s)[:, None], axis=0)])
+        turned = integrated(rates_w, s_s)
         at_s = [(t_ns - t_g[0]) * 1e-9 - offset_s for t_ns in (t0_ns, t1_ns)]
         return np.column_stack([np.interp(at_s[1], s_s, axis) - np.interp(at_s[0], s_s, axis) for axis in turned.T])
 
@@ -266,8 +265,7 @@ class Telemetry:
         t = np.concatenate([[t0_ns], inside, [t1_ns]])
         yaw, pitch, roll = (np.interp(t, t_a, angle) for angle in _unwrapped(angles))
         r_w_b = np.stack([rotate_to_world([*axis], yaw, pitch, roll) for axis in np.eye(3)], axis=2)
-        step = np.einsum("nij,nkj->nik", r_w_b[1:], r_w_b[:-1])
-        turned = 0.5 * np.column_stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
+        turned = small_turns(r_w_b[:-1], r_w_b[1:])
         # The integral of the rates, from one attitude to the next, in the world by the attitude between them.
         summed = [np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t_g) * 1e-9)]) for a in w]
         by_gyro = [np.diff(np.interp(t, t_g, axis)) for axis in summed]
