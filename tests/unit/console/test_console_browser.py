@@ -4,7 +4,6 @@ a lost flight asks for, and a connection that is lost and found again."""
 import csv
 import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,20 +23,6 @@ pytestmark = [
     pytest.mark.skipif(browser.program() is None, reason="no Chromium on this computer: the page is not tried in it"),
 ]
 COMPUTED_S = 120.0  # longest wait for ten frames; processes of others may take the processors
-
-
-@pytest.fixture(scope="module")
-def opened() -> Iterator[Browser]:
-    with Browser() as window:
-        yield window
-
-
-@pytest.fixture
-def window(opened: Browser) -> Browser:
-    """With an empty page, and no errors of the one before."""
-    opened.open("about:blank")
-    opened.errors.clear()
-    return opened
 
 
 def enter(window: Browser, field: str, value: object) -> None:

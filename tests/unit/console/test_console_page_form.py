@@ -10,7 +10,7 @@ import pytest
 import browser
 import page_flight as page
 from browser import Browser
-from console_rig import Console, photo, settings
+from console_rig import Console, photo
 from terrafix_tools.console.events import CandidateTile, UserInputNeeded
 from terrafix_tools.console.payloads import FlightState, Gps, InputRequest, UserFix
 from terrafix_tools.console.store import flights
@@ -30,26 +30,6 @@ SMALL_TEXTS = """[...document.querySelectorAll('body *')]
   .filter((e) => e.checkVisibility() && !e.closest('.leaflet-control') && parseFloat(getComputedStyle(e).fontSize) < 16)
   .filter((e) => [...e.childNodes].some((node) => node.nodeType === 3 && node.data.trim()))
   .map((e) => e.className + ': ' + e.textContent.slice(0, 40))"""
-
-
-@pytest.fixture(scope="module")
-def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
-    with Console(settings(tmp_path_factory.mktemp("console"))) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def opened() -> Iterator[Browser]:
-    with Browser() as window:
-        yield window
-
-
-@pytest.fixture
-def window(opened: Browser) -> Browser:
-    opened.open("about:blank")
-    opened.errors.clear()
-    opened.resize(1400, 900)
-    return opened
 
 
 @pytest.fixture(scope="module")
@@ -119,17 +99,19 @@ def test_a_telephone_has_the_map_above_the_fold_and_its_tools_under_the_thumb(
     assert window.run("[...document.querySelectorAll('.bar nav a')].every((link) => link.checkVisibility())")
 
 
+def each_page(window: Browser, console: Console, *flight_ids: str) -> Iterator[str]:
+    """Opens the pages of the flights, the form and the list, one after the other. -> the path of each."""
+    pages = {**{f"flight/{one}": ".tabs" for one in flight_ids}, "new": "form.new", "": ".flights"}
+    for path, shown in pages.items():
+        window.open(f"{console.url}/page/#/{path}")
+        window.wait(f"document.querySelector('{shown}')")
+        yield path
+
+
 @pytest.mark.parametrize("width", SIZES)
 def test_no_text_is_smaller_than_16_px(console: Console, window: Browser, asking: str, live: str, width: int) -> None:
     window.resize(width, SIZES[width])
-    for path, shown in (
-        (f"flight/{asking}", ".tabs"),
-        (f"flight/{live}", ".tabs"),
-        ("new", "form.new"),
-        ("", ".flights"),
-    ):
-        window.open(f"{console.url}/page/#/{path}")
-        window.wait(f"document.querySelector('{shown}')")
+    for _ in each_page(window, console, asking, live):
         assert window.run(SMALL_TEXTS) == []
 
 
@@ -182,14 +164,7 @@ def test_axe_has_no_serious_finding(console: Console, window: Browser, asking: s
     assert AXE is not None and AXE.origin is not None
     script = (Path(AXE.origin).parent / "axe.min.js").read_text(encoding="utf-8")
     window.dark(theme == "dark")
-    for path, shown in (
-        (f"flight/{asking}", ".tabs"),
-        (f"flight/{live}", ".tabs"),
-        ("new", "form.new"),
-        ("", ".flights"),
-    ):
-        window.open(f"{console.url}/page/#/{path}")
-        window.wait(f"document.querySelector('{shown}')")
+    for path in each_page(window, console, asking, live):
         window.run(f"{script}; 0")
         if path == f"flight/{live}":
             page.health(console, live)
@@ -241,6 +216,7 @@ def test_a_photo_flight_is_made_looked_at_helped_and_completed_by_keyboard_alone
     window.wait("document.querySelector('.cell.wide').innerText.includes('placed')")
     tab_to(window, ".map")
     tab_to(window, ".frame-card .frame-view")
+    window.wait("document.querySelector('.frame-card img')?.naturalWidth > 0")  # before that its keys mean nothing
     for key in ("ArrowRight", "ArrowDown", "+", "Enter"):
         window.press(key, key if key == "+" else "")
     window.wait("document.querySelector('.toast')")  # no position of a pixel without a record: an answer all the same

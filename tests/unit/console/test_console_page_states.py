@@ -3,7 +3,6 @@ the verdict on the flight, what the autopilot has, and the words for all of it. 
 
 import json
 import re
-from collections.abc import Iterator
 
 import pytest
 from pyproj import Transformer
@@ -11,7 +10,7 @@ from pyproj import Transformer
 import browser
 import page_flight as page
 from browser import Browser
-from console_rig import Console, settings
+from console_rig import Console
 from terrafix.link.integrity import fix_type
 from terrafix.messages import Verdict
 from terrafix_tools import flight_verdict
@@ -33,26 +32,6 @@ IN_PART = WholeVerdict(
     trusted_share=0.5,
     reasons=["no map match for over 35 s"],
 )
-
-
-@pytest.fixture(scope="module")
-def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
-    with Console(settings(tmp_path_factory.mktemp("console"))) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def opened() -> Iterator[Browser]:
-    with Browser() as window:
-        yield window
-
-
-@pytest.fixture
-def window(opened: Browser) -> Browser:
-    opened.open("about:blank")
-    opened.errors.clear()
-    opened.resize(1400, 900)
-    return opened
 
 
 def show(window: Browser, console: Console, flight_id: str) -> None:

@@ -3,7 +3,6 @@ an upload that is cancelled, broken off and gone on with, and a flight that is c
 
 import json
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,7 @@ import pytest
 import browser
 import page_flight as page
 from browser import Browser
-from console_rig import Console, batch, photo, settings
+from console_rig import Console, batch, photo
 from terrafix_tools.console.store import flights
 
 pytestmark = [
@@ -21,25 +20,6 @@ pytestmark = [
 ]
 NAMES = [f"DJI_{number:04d}.JPG" for number in (7, 8, 10, 11, 12, 40, 41, 42, 99, 100)]  # gaps are normal
 UPLOADED_S = 180.0
-
-
-@pytest.fixture(scope="module")
-def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
-    with Console(settings(tmp_path_factory.mktemp("console"))) as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def opened() -> Iterator[Browser]:
-    with Browser() as window:
-        yield window
-
-
-@pytest.fixture
-def window(opened: Browser) -> Browser:
-    opened.open("about:blank")
-    opened.errors.clear()
-    return opened
 
 
 @pytest.fixture(scope="module")
