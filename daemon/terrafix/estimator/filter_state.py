@@ -2,6 +2,7 @@
 
 `Propagation` adds frames, `MapUpdate` adds map poses, `reset` begins a new graph. All work on one `FilterState`."""
 
+import math
 from array import array
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -287,18 +288,31 @@ class FilterState:
 
     def amsl(self, frame: FrameState) -> tuple[float, float]:
         """Height of the camera AMSL [m], and its 1-sigma beyond the covariance of the graph. Without a DEM the graph
-        has the height above the ground that is seen, and the barometer tells how high that ground lies."""
+        has the height above the ground that is seen, and the barometer tells how high that ground lies. With one,
+        images and barometer are two measurements: where they differ by more than a barometer drifts, one of them is
+        wrong (a lens that zooms, tree tops), and nothing says which."""
         p = frame.pose.translation()
         scale, sigma = self.height_scale(frame.node)
-        if self.terrain.has_dem or not self.has_height:
-            ground_m = self.terrain.elevation_m(p)
-            seen_m = float(p[UP]) - ground_m
-            return ground_m + scale * seen_m, sigma * seen_m
-        seen_m = self.graph.state(frame.node).barometric_up_m - self.terrain.ground_m
-        drift_m = WALK_SIGMAS[HEIGHT] * np.sqrt(frame.t_s - self.began_s)
-        return self.terrain.ground_m + scale * seen_m, float(
-            np.linalg.norm([self.origin.agl_sigma_m, drift_m, sigma * seen_m])
-        )
+        if not self.has_height:
+            return self._image_amsl(p, scale, sigma)
+        drift_m = float(WALK_SIGMAS[HEIGHT] * np.sqrt(frame.t_s - self.began_s))
+        by_barometer = self.graph.state(frame.node)
+        if self.terrain.has_dem:
+            amsl_m, sigma_m = self._image_amsl(p, scale, sigma)
+            seen_m = by_barometer.barometric_up_m - self.terrain.elevation_m(p)
+            stretched_m = float(np.expm1(by_barometer.calibration[LOG_HEIGHT_SCALE])) * seen_m
+            apart_m = by_barometer.barometric_up_m + stretched_m - amsl_m
+            beyond_m2 = max(apart_m**2 - self.origin.agl_sigma_m**2 - drift_m**2, 0.0)
+            return amsl_m, math.hypot(sigma_m, math.sqrt(beyond_m2))
+        seen_m = by_barometer.barometric_up_m - self.terrain.ground_m
+        sigma_m = math.hypot(self.origin.agl_sigma_m, drift_m, sigma * seen_m)
+        return self.terrain.ground_m + scale * seen_m, sigma_m
+
+    def _image_amsl(self, p: np.ndarray, scale: float, sigma: float) -> tuple[float, float]:
+        """AMSL height [m] of a camera at ``p`` (3,) above the ground below it, and its 1-sigma by the focal length."""
+        ground_m = self.terrain.elevation_m(p)
+        seen_m = float(p[UP]) - ground_m
+        return ground_m + scale * seen_m, sigma * seen_m
 
 
 def focal_scale(camera: Camera, log_height_scale: float) -> float:

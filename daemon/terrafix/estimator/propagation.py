@@ -38,6 +38,7 @@ from terrafix.estimator.registration import PredictedFrame, RegisteredFrame, Ste
 from terrafix.estimator.state import (
     DELTA_MOTION,
     DELTA_P,
+    DELTA_V,
     HEADING,
     HORIZONTAL,
     MOTION_SIZE,
@@ -200,12 +201,7 @@ class Propagation:
                 replace(predicted, cov=cov), [*verdicts, reset], confirmed=not state.images_contradicted
             )
         if self._is_velocity_wrong(odometry) and predicted.increment is not None:
-            off_m, self._signed = self._signed.sum_m, SignedInnovations()
-            cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
-            cov[HORIZONTAL, HORIZONTAL] += np.outer(off_m, off_m)
-            detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
-            reset = _reset_verdict(ResetReason.VELOCITY, detail)
-            return self._continue(replace(predicted, cov=cov), [*verdicts, reset])
+            return self._reset_velocity(predicted, verdicts)
         if (off_mps := self._start_off_mps(predicted)) is not None:
             return self._leave_start(predicted, off_mps, verdicts)
         above_m = None if odometry.fused is None else float(predicted.p_m[UP]) - state.terrain.ground_m
@@ -217,6 +213,26 @@ class Propagation:
             verdicts = [*verdicts, _reset_verdict(ResetReason.UNMEASURED_TAKE_OFF)]
             return PropagationResult(Verdict.ACCEPTED, placed, predicted.step_m, sigma_m, verdicts=tuple(verdicts))
         return self._reset_yaw_gauge(predicted, verdicts)
+
+    def _reset_velocity(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
+        """A new graph where odometry has been to one side of the prediction for frames. Either of the two is wrong. The
+        inertial readings of a prediction are believed, as far as the images may be right, until a place confirms
+        these; without such readings velocity is unknown."""
+        innovation, cov = predicted.odometry.motion_innovation, predicted.cov.copy()
+        assert innovation is not None
+        signed, self._signed = self._signed, SignedInnovations()
+        off_m = signed.sum_m
+        cov[HORIZONTAL, HORIZONTAL] += np.outer(off_m, off_m)
+        if innovation.inertial:
+            off_mps = signed.largest_m / innovation.dt_s
+            cov[DELTA_V, DELTA_V][HORIZONTAL, HORIZONTAL] += np.outer(off_mps, off_mps)
+            self._state.images_contradicted = True
+        else:
+            cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
+        detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
+        reset = _reset_verdict(ResetReason.VELOCITY, detail)
+        confirmed = not innovation.inertial
+        return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=confirmed)
 
     def _start_off_mps(self, predicted: PredictedFrame) -> np.ndarray | None:
         if self._state.last_fix_s is not None:  # the map tells where it started
@@ -257,7 +273,7 @@ class Propagation:
     ) -> PropagationResult:
         """``confirmed``: as in ``reset``."""
         odometry = predicted.odometry
-        joined = odometry.fused is not None and odometry.fragment.joined
+        joined = confirmed and odometry.fused is not None and odometry.fragment.joined
         step_m = predicted.step_m
         placed = continue_from(
             self._state,

@@ -13,6 +13,7 @@ from terrafix.estimator.claim import claim
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
+from terrafix.estimator.state import HEIGHT
 from terrafix.messages import ClaimBudget, LensEstimate, MapMatch, NavEstimate
 
 FRAMES = 24
@@ -91,6 +92,22 @@ def test_tilt_and_height_have_what_the_graph_cannot_know_beside_its_covariance(
     _, amsl_sigma_m = estimator.state.amsl(frame)
     assert amsl_sigma_m > 0.3 and estimator.map_sigma_m == 0.0
     assert added.diagonal()[2:] == pytest.approx([amsl_sigma_m**2, tilt**2, tilt**2, 0.0])
+
+
+@pytest.mark.parametrize(("apart_m", "beyond_m"), [(1.0, 0.0), (25.0, 24.0), (-25.0, 24.0)])
+def test_images_and_barometer_that_differ_widen_the_height(
+    placed: tuple[Estimator, FrameState], apart_m: float, beyond_m: float
+) -> None:
+    """A lens that zooms moves the images, weather the barometer. With a DEM both are heights above the sea."""
+    estimator, frame = placed
+    state = estimator.state
+    calibration = state.graph.state(frame.node).calibration
+    before, kept = state.amsl(frame), calibration.copy()
+    calibration[HEIGHT] = apart_m
+    amsl_m, sigma_m = state.amsl(frame)
+    calibration[:] = kept
+    assert state.terrain.has_dem and amsl_m == before[0]
+    assert sigma_m == pytest.approx(np.hypot(before[1], beyond_m), abs=2.0)
 
 
 def test_a_learnt_principal_point_shifts_the_position_by_its_lever() -> None:

@@ -213,3 +213,19 @@ def test_images_that_contradict_inertial_readings_for_long_are_not_believed_for_
     assert Verdict.ACCEPTED not in {verdicts[i] for i in range(FIRST, END)}
     assert result.contradicted == set(range(resets[0].frame_id, END))  # the map match of frame END decides
     assert result.is_back(3.0)
+
+
+def squeezed(odometry: Odometry, _: np.random.Generator) -> Odometry:
+    """16:9 in 4:3: one axis of the image has another scale."""
+    return with_pairs(odometry, np.array(odometry.two_view) * (1.0, 4.0 / 3.0, 1.0, 4.0 / 3.0))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_images_that_are_squeezed_in_flight_contradict_inertial_readings(seed: int) -> None:
+    """Each motion alone passes the innovation gate."""
+    result = flown(seed, squeezed, lambda _: None)
+    assert not result.lies()
+    resets = [v for v in result.resets() if v.detail.endswith("to one side of the prediction")]
+    assert resets and resets[0].frame_id * FRAME_S - FIRST * FRAME_S < 3.0
+    assert result.contradicted
+    assert result.is_back(3.0)
