@@ -47,7 +47,7 @@ class Shot:
     t_s: float
     p_m: np.ndarray  # (3,) of the camera, which is at the origin of the body
     r_w_c: np.ndarray  # (3, 3)
-    r_w_b: np.ndarray  # (3, 3) of the body, or of the stabilised frame of a gimbal
+    r_w_b: np.ndarray  # (3, 3) of the body, or of the stabilised frame of a gimbal that reports nothing
     velocity_mps: np.ndarray  # (3,)
     scale: tuple[float, float] = (1.0, 1.0)  # of the picture's content about its centre; negative: mirrored
     dark: bool = False  # the picture shows nothing
@@ -112,7 +112,8 @@ def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
     def shot(at: State) -> Shot:
         held = hanging.r_w_c(at)
         p_m = at.p_b_in_w_m - np.array([*claimed, 0.0])
-        return Shot(at.t_s, p_m, held @ tilt, held @ r_b_c.T, at.velocity_enu_mps)
+        r_w_b = at.r_w_b() if plan.gimbal_reports else held @ r_b_c.T
+        return Shot(at.t_s, p_m, held @ tilt, r_w_b, at.velocity_enu_mps)
 
     steps = flown(
         vehicle,
