@@ -247,7 +247,7 @@ class EstimatorNode:
         return ()
 
     def _on_gimbal(self, attitude: GimbalAttitude) -> Iterable[Message]:
-        self._telemetry.gimbal.add(attitude)
+        self._telemetry.add_gimbal(attitude)
         return ()
 
     def _on_health(self, health: Health) -> Iterable[Message]:

@@ -19,6 +19,7 @@ from terrafix_lab.sim.camera.lens import Fisheye, Lens, Pinhole
 from terrafix_tools.camera.board import SQUARE_PX, Board, parse_board, print_board
 from terrafix_tools.camera.calibrating import BoardView, calibrate
 from terrafix_tools.camera.cli import app
+from terrafix_tools.camera.frames import board_views
 
 BOARD = parse_board("charuco:8x6:30mm")
 LENS = Pinhole(CameraCalibration(480, 360, 390.0, 391.0, 241.3, 177.8, (-0.22, 0.07, 0.0005, -0.0004, -0.01)))
@@ -91,7 +92,7 @@ def upper_left(view: BoardView) -> BoardView:
 @pytest.mark.parametrize(
     ("views", "missing"),
     [
-        ([], "10 more images"),
+        ([], "10 more images .*found in none; is it the one of --board"),
         (seen(BOARD, LENS, 1)[:6], "4 more images"),
         (seen(BOARD, LENS, 1, tilt_deg=4.0), "tilted up and down"),
         ([upper_left(view) for view in seen(BOARD, LENS, 1)], "parts of the image: upper right, .*lower right"),
@@ -103,6 +104,11 @@ def test_a_set_that_does_not_determine_the_lens_is_refused_with_what_is_missing(
     with pytest.raises(SourceError, match=missing) as error:
         calibrate(views, (480, 360), BOARD, "pinhole")
     assert "\n" not in str(error.value)
+
+
+def test_a_folder_of_images_that_is_not_there_is_named() -> None:
+    with pytest.raises(SourceError, match="noboards: no such file or folder"):
+        board_views(["noboards"], BOARD)
 
 
 def test_another_board_than_stated_is_refused() -> None:

@@ -12,6 +12,7 @@ from simulated_flight import ORIGIN, EstimatorRun, Flight, cov_of, error_m
 from terrafix.core.camera import camera_rotation
 from terrafix.core.geodesy import euler_from_rot, rot_from_quat, rot_w_b, yaw_of
 from terrafix.core.mavlink.gimbal import quat_from_euler
+from terrafix.estimator.measurements.gimbal import GimbalReports
 from terrafix.messages import (
     Gimbal,
     GimbalAttitude,
@@ -34,6 +35,12 @@ def origin(gimbal: Gimbal | None = None) -> Origin:
     return msgspec.structs.replace(ORIGIN, camera=camera)
 
 
+def leaning(state: VehicleState, i: int) -> VehicleState:
+    """As ``rolling``, and the vehicle pitches as much."""
+    leans_rad = ROLL_RAD * math.sin(0.7 * i)
+    return msgspec.structs.replace(rolling(state, i), pitch_rad=leans_rad)
+
+
 def rolling(state: VehicleState, i: int) -> VehicleState:
     """The vehicle's attitude; that of the camera's platform is the one of ``state``."""
     return msgspec.structs.replace(state, pitch_rad=0.1, roll_rad=ROLL_RAD * math.sin(1.3 * i))
@@ -48,12 +55,12 @@ def held(state: VehicleState, *, from_north: bool = True, up_deg: float = 0.0, l
     return GimbalAttitude(t_ns=state.t_ns + round(late_s * 1e9), q=q, from_north=from_north)
 
 
-def by_gimbal(reports: Reports) -> Iterator[Message]:
+def by_gimbal(reports: Reports, leans: Callable[[VehicleState, int], VehicleState] = rolling) -> Iterator[Message]:
     for i in range(FRAMES):
         for message in FLIGHT.messages(i):
             if isinstance(message, VehicleState):
+                yield leans(message, i)
                 yield from reports(i, message)
-                yield rolling(message, i)
             else:
                 yield message
 
@@ -65,7 +72,7 @@ def fixed() -> EstimatorRun:
 
 def flown(reports: Reports, gimbal: Gimbal | None = None) -> EstimatorRun:
     run = EstimatorRun()
-    run.feed([origin(gimbal), *by_gimbal(reports)])
+    run.feed([origin(gimbal), *by_gimbal(reports, leaning if reports is of_servos else rolling)])
     return run
 
 
@@ -105,6 +112,38 @@ def test_the_published_attitude_is_that_of_the_vehicle() -> None:
         assert math.remainder(yaw - yaw_of(FLIGHT.r_w_b[estimate.frame_id]), math.tau) == pytest.approx(0.0, abs=0.15)
 
 
+def of_servos(i: int, state: VehicleState) -> list[GimbalAttitude]:
+    """As ArduPilot reports a mount with servos that point down: the vehicle's roll and pitch with the other sign."""
+    leans = leaning(state, i)
+    assert leans.pitch_rad is not None and leans.roll_rad is not None
+    q = quat_from_euler(0.0, -math.pi / 2 - leans.pitch_rad, -leans.roll_rad)
+    return [GimbalAttitude(t_ns=state.t_ns, q=q, from_north=False)]
+
+
+# arducopter 4.7-dev (SITL), mount sent straight down by MAVLink, attitude targets: pitch of the vehicle [degrees] and
+# quaternion of GIMBAL_DEVICE_ATTITUDE_STATUS (flags 44: roll lock, pitch lock, yaw in the vehicle's frame) 2 s later.
+OF_TYPE_1 = (
+    (-1.9, (0.708, -0.007, -0.706, -0.007)),
+    (15.1, (0.707, 0.009, -0.707, 0.009)),  # the servo is at its limit, -90
+    (0.2, (0.707, 0.015, -0.707, 0.015)),
+    (-16.2, (0.789, -0.014, -0.614, -0.011)),
+    (0.5, (0.712, 0.009, -0.702, 0.009)),
+)
+OF_TYPE_7 = tuple((pitch_deg, (0.707, 0.0, -0.707, 0.0)) for pitch_deg in (-1.3, 16.2, -15.3, 0.7))  # what it is sent
+
+
+@pytest.mark.parametrize(("reported", "opposes"), [(OF_TYPE_1, True), (OF_TYPE_7, False)])
+def test_fact_ardupilot_reports_the_angles_of_servos_and_what_a_brushless_gimbal_is_sent(
+    reported: tuple[tuple[float, tuple[float, float, float, float]], ...], opposes: bool
+) -> None:
+    reports = GimbalReports()
+    for i, (pitch_deg, q) in enumerate(reported):
+        w, x, y, z = np.array(q) / np.linalg.norm(q)
+        report = GimbalAttitude(t_ns=round(2e9 * i), q=(w, x, y, z), from_north=False)
+        reports.add(report, math.radians(pitch_deg))
+    assert reports.opposes is opposes and reports.is_level is not opposes
+
+
 def no_report(_i: int, _state: VehicleState) -> list[GimbalAttitude]:
     return []
 
@@ -136,7 +175,7 @@ def ambiguous(i: int, state: VehicleState) -> list[GimbalAttitude]:
     return [GimbalAttitude(t_ns=state.t_ns, q=q, from_north=True)]
 
 
-@pytest.mark.parametrize("reports", [no_report, lost, frozen, late, ambiguous])
+@pytest.mark.parametrize("reports", [no_report, lost, frozen, late, ambiguous, of_servos])
 def test_the_claim_holds_when_reports_are_missing_late_frozen_or_ambiguous(reports: Reports) -> None:
     run = flown(reports)
     assert sigmas(run).max() < 3.5

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from terrafix_lab.faults.edits import Span, unchanged
+from terrafix.core.geodesy import rot_from_quat
+from terrafix_lab.faults.edits import Span, gimbal_reports, unchanged
 from terrafix_lab.faults.source import EditedSensors
 from terrafix_lab.faults.table import FAULTS
+from terrafix_lab.sim.camera.mount import Gimbal
 from terrafix_lab.sim.interfaces import Readings, State
 
 ZERO = np.zeros(3)
@@ -17,7 +19,8 @@ STATE = State(0.0, np.array([0.0, 0.0, 620.0]), ZERO, 0.5, 0.1, -0.2, 100.0, ZER
 class Perfect:
     def read(self, state: State) -> Readings:
         angles = state.yaw_rad, state.pitch_rad, state.roll_rad
-        return Readings(state.t_s, ZERO, ZERO, *angles, float(state.p_b_in_w_m[2]), None, None, None)
+        held = Gimbal(error_deg=0.0).reported(state)
+        return Readings(state.t_s, ZERO, ZERO, *angles, float(state.p_b_in_w_m[2]), None, None, None, held)
 
 
 def read(fault: str, span: Span, zero_s: float = 0.0) -> list[Readings]:
@@ -41,6 +44,29 @@ def test_late_telemetry_shows_what_was_and_true_readings_come_back() -> None:
     assert (sensors.read(STATE).pitch_rad, sensors.read(STATE).roll_rad) == (-0.2, 0.1)
     sensors.alter(unchanged)
     assert (sensors.read(STATE).pitch_rad, sensors.read(STATE).roll_rad) == (0.1, -0.2)
+
+
+def views(readings: list[Readings]) -> list[tuple[float, float] | None]:
+    """Heading of a gimbal's right axis less that of STATE's [rad], and angle of its view to straight down [degrees]."""
+    found: list[tuple[float, float] | None] = []
+    for held in (r.gimbal for r in readings):
+        r_w_g = np.eye(3) if held is None else rot_from_quat(held)
+        heading_rad, view_deg = np.arctan2(-r_w_g[0, 1], r_w_g[1, 1]) - 0.5, np.degrees(np.arccos(r_w_g[2, 0]))
+        found.append(None if held is None else (float(heading_rad), float(view_deg)))
+    return found
+
+
+def test_reports_of_a_gimbal_are_missing_late_frozen_drifting_or_of_a_view_of_the_horizon_within_their_span() -> None:
+    span, true = Span(3.0, 6.0, ""), [0.1 * i for i in range(10)]
+    assert [v is None for v in views(read("gimbal not reported", span))] == [3 <= i <= 6 for i in range(10)]
+    frozen, late = views(read("gimbal frozen", span)), EditedSensors(Perfect())
+    late.alter(gimbal_reports(span, age_s=lambda _: 2.0))
+    seen = views([late.read(replace(STATE, t_s=float(t), yaw_rad=0.5 + 0.1 * t)) for t in range(10)])
+    assert [v and v[0] for v in frozen] == pytest.approx([*true[:3], *[0.3] * 4, *true[7:]])
+    assert [v and v[0] for v in seen] == pytest.approx([*true[:3], 0.1, 0.2, 0.3, 0.4, *true[7:]])
+    drift, away = (views(read(f"gimbal {name}", span)) for name in ("drifts", "looks away"))
+    assert [v and v[1] for v in drift] == pytest.approx([0, 0, 0, 0, 0.25, 0.5, 0.75, 0, 0, 0], abs=1e-4)
+    assert [v and round(v[1]) for v in away] == [0, 0, 0, 90, 90, 90, 90, 0, 0, 0]
 
 
 @pytest.mark.parametrize("name", [name for name, fault in FAULTS.items() if fault.process is None])

@@ -67,7 +67,7 @@ def test_invalid_videos_are_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="the video is 320x240"):
         open_source(str(path))
     path.with_suffix(".toml").unlink()
-    with pytest.raises(SourceError, match=r"write flight\.toml beside it"):
+    with pytest.raises(SourceError, match=r"'terrafix camera calibrate'.*--out .*flight\.toml"):
         open_source(str(path))
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(path.read_bytes()[:500])

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from pyproj import Transformer
 
-from terrafix_lab.sim.flights.folder import FRAME_HZ, Flight, plan_flight, write_flight
+from terrafix.messages import Camera
+from terrafix_lab.sim.flights.folder import CAMERA, FRAME_HZ, ON_GIMBAL, Flight, plan_flight, write_flight
 from terrafix_lab.sim.world import place as world
 from terrafix_tools.mapping.build import build
 
@@ -30,6 +31,7 @@ class GroundKind:
     hills: bool = False
     lake: bool = False
     contrast: float = 1.0
+    camera: Camera = CAMERA
 
 
 KINDS = {
@@ -38,6 +40,7 @@ KINDS = {
     "low texture": GroundKind(contrast=LOW_CONTRAST),
     "water": GroundKind(lake=True),
     "hills": GroundKind(hills=True),
+    "gimbal": GroundKind(camera=ON_GIMBAL),
 }
 
 
@@ -50,7 +53,7 @@ def make(
     if ground.hills:
         place = replace(place, layout=replace(place.layout, dem_amsl_m=_with_hills(place.dem_amsl_m, seed)))
     looks = [_flattened(place.render(name), ground.contrast) for name in ground.looks]
-    flight = plan_flight(place, looks[1], frames / FRAME_HZ)
+    flight = plan_flight(place, looks[1], frames / FRAME_HZ, camera=ground.camera)
     if ground.lake:
         lake = _lake(place, flight, looks[1].shape)
         looks = [_flooded(image, lake, [seed, number]) for number, image in enumerate(looks)]

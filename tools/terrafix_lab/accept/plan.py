@@ -11,7 +11,7 @@ from terrafix_lab.accept.flight import AcceptFlight
 from terrafix_lab.accept.measuring.criteria import PERMANENT, SCARCE, TEMPORARY, WITH_SPAN
 from terrafix_lab.accept.measuring.results import Marks
 from terrafix_lab.faults.edits import Edit, OriginEdit, unchanged, unchanged_origin
-from terrafix_lab.faults.fault import START, Fault
+from terrafix_lab.faults.fault import START, Fault, Need
 from terrafix_lab.faults.messages import AlteredAnchor
 from terrafix_lab.sim.flights.folder import FRAME_HZ
 from terrafix_tools.replay import MakeNodes, make_nodes
@@ -80,4 +80,5 @@ def scenario_of(fault: Fault, criteria: tuple[str, ...] | None = None, frames: i
         ends = fault.lasts_s is not None
         criteria = (WITH_SPAN if ends else SCARCE) if fault.is_true else (TEMPORARY if ends else PERMANENT)
     frames = max(frames, math.ceil(fault.flight_s * FRAME_HZ) + 2)
-    return Scenario(fault.name, fault.words, criteria, partial(plan_of, fault), frames=frames)
+    ground = "gimbal" if Need.GIMBAL in fault.needs else "base"
+    return Scenario(fault.name, fault.words, criteria, partial(plan_of, fault), ground, frames)

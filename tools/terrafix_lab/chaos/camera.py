@@ -8,6 +8,7 @@ from itertools import chain, islice
 
 import cv2
 import numpy as np
+from msgspec import UnsetType
 
 from terrafix.messages import Camera, Frame
 from terrafix.vision.sources import Shot
@@ -110,9 +111,10 @@ class _Jpegs:
 def camera_toml(camera: Camera, attitude_sigma_deg: float | None = None) -> str:
     """The description of the camera for `terrafix run`."""
     telemetry = "" if attitude_sigma_deg is None else f"[telemetry]\nattitude_sigma_deg = {attitude_sigma_deg}\n"
+    gimbal = "" if isinstance(camera.gimbal, UnsetType) else 'gimbal = "mavlink"\n'
     return (
         f'name = "chaos"\n[camera]\nwidth = {camera.width}\nheight = {camera.height}\n'
         f"fx = {camera.fx}\nfy = {camera.fy}\ncx = {camera.cx}\ncy = {camera.cy}\nfocal_sigma = {camera.focal_sigma}\n"
         f"distortion = {list(camera.distortion)}\n"
-        f"[mount]\ntolerance_deg = {camera.mount_tolerance_deg}\n{telemetry}"
+        f"[mount]\ntolerance_deg = {camera.mount_tolerance_deg}\n{gimbal}{telemetry}"
     )

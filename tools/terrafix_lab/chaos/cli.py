@@ -46,6 +46,7 @@ def chaos(
     from terrafix_lab.chaos.table import line, write_table
     from terrafix_lab.faults.fault import Need, Phase, check_flown_by
     from terrafix_lab.faults.table import FAULTS, MATRIX
+    from terrafix_lab.sim.flights.folder import CAMERA, ON_GIMBAL
 
     faults = [f for f in FAULTS.values() if any(f.name.startswith(name) for name in fault)] if fault else [*MATRIX]
     phases = [p for p in Phase if (not phase or p.value in phase) and not ((flight or vehicle) and p is Phase.LANDING)]
@@ -65,9 +66,13 @@ def chaos(
         return
     for chosen in faults:
         check_flown_by("terrafix chaos --fault", chosen)
-    on_deck, elsewhere = (any(need in f.needs for f in faults) for need in (Need.DECK, Need.ELSEWHERE))
+    on_deck, elsewhere, gimbal = (
+        any(need in f.needs for f in faults) for need in (Need.DECK, Need.ELSEWHERE, Need.GIMBAL)
+    )
     if on_deck and (vehicle or flight or any(Need.DECK not in f.needs for f in faults)):
         raise UsageError("a start on a deck is a flight of its own, of a copter; give it as the only --fault")
+    if gimbal and (flight or on_deck or any(Need.GIMBAL not in f.needs for f in faults)):
+        raise UsageError("a camera on a gimbal is a flight of its own; give faults of gimbals alone, without --flight")
     if elsewhere and flight is not None:
         raise UsageError("pictures of another place are those of a generated flight; omit --flight")
     try:
@@ -82,8 +87,8 @@ def chaos(
     elif flight is not None:
         scene = recorded_scene(flight, map_path, out)
     else:
-        name = vehicle or "flight"
-        scene = scene_in(out / f"{name}-{seed}", seed, vehicle)
+        name = f"{vehicle or 'flight'}{'-gimbal' if gimbal else ''}"
+        scene = scene_in(out / f"{name}-{seed}", seed, vehicle, camera=ON_GIMBAL if gimbal else CAMERA)
         if elsewhere:
             scene = replace(scene, elsewhere=scene_in(out / f"{name}-{seed + 1}", seed + 1, vehicle).jpeg)
     cells = [(f, p) for p in phases for f in faults if again or not results.has(f, p)]

@@ -24,6 +24,7 @@ from terrafix_lab.faults.fault import Need
 from terrafix_lab.faults.processes import COOL_MC, SUPERVISOR
 from terrafix_lab.sim.autopilot.course import PeerState
 from terrafix_lab.sim.autopilot.peer import AutopilotPeer
+from terrafix_lab.sim.camera.mount import mount_of
 from terrafix_lab.sim.camera.stream import FrameStream
 from terrafix_tools import child_process
 
@@ -64,7 +65,11 @@ class Rig:
         self.map_path.write_bytes(scene.map_path.read_bytes())
         self.set_temperature(COOL_MC)
         self.peer: AutopilotPeer = AutopilotPeer(
-            seed=seed, kind=scene.kind, home_amsl_m=self._home_amsl_m(), aligned=not scene.disarmed
+            seed=seed,
+            kind=scene.kind,
+            home_amsl_m=self._home_amsl_m(),
+            aligned=not scene.disarmed,
+            mount=mount_of(scene.camera),
         )
         self.stream = FrameStream()
         self.camera = StreamedCamera(self.stream, scene.jpeg, self.flight_s, scene.frame_hz)

@@ -62,16 +62,16 @@ class ChaosScene:
         return self.jpegs[index].read_bytes()
 
 
-def scene_in(folder: Path, seed: int, in_air: Kind | None = None) -> ChaosScene:
+def scene_in(folder: Path, seed: int, in_air: Kind | None = None, *, camera: Camera = CAMERA) -> ChaosScene:
     """The flight in ``folder``, which is generated if it is not there: of a copter from ground to ground, or of
     ``in_air`` in the air. Raises OutputError, SourceError."""
     kind = in_air or Kind.COPTER
     if not (folder / COURSE).exists():
-        wanted = FlightOptions(seed=seed, vehicle=kind, duration_s=AIR_S, agl_m=AGL_OF[kind])
+        wanted = FlightOptions(seed=seed, vehicle=kind, duration_s=AIR_S, agl_m=AGL_OF[kind], camera=camera)
         if in_air is None:
             mission = folder.with_suffix(".waypoints")
             write_mission(mission, mission_along("two legs", seed, WAY))
-            wanted = FlightOptions(seed=seed, mission=mission, vehicle=kind)
+            wanted = FlightOptions(seed=seed, mission=mission, vehicle=kind, camera=camera)
         course_of(make(folder, wanted, progress=False), folder)
     course = read_course(folder / COURSE)
     jpegs = sorted((folder / "frames").glob("*.jpg"))
@@ -79,7 +79,7 @@ def scene_in(folder: Path, seed: int, in_air: Kind | None = None) -> ChaosScene:
         raise SourceError(f"{folder}: has no images; remove it, and it is generated anew")
     duration_s = len(jpegs) / FRAME_HZ
     at_s = phases(course, duration_s) if in_air is None else phases_in_the_air(course, duration_s)
-    return ChaosScene(folder / MAP_NAME, jpegs, course, at_s, duration_s, kind=kind)
+    return ChaosScene(folder / MAP_NAME, jpegs, course, at_s, duration_s, camera, kind=kind)
 
 
 def course_of(flight: Flight, folder: Path) -> Course:

@@ -13,14 +13,16 @@ from itertools import islice, tee
 import msgspec
 import numpy as np
 
-from terrafix.core.geodesy import LocalFrame
+from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
 from terrafix.core.node import Image
-from terrafix.messages import Imu, Origin, VehicleState
+from terrafix.core.pose import exp_so3
+from terrafix.messages import GimbalAttitude, Imu, Message, Origin, VehicleState
 from terrafix.vision.sources import Shot
 from terrafix.vision.sources.contract import TimedMessage
 
 FEET_IN_A_METRE = 3.28084
 FOCAL_SIGMA = 0.01  # stated relative 1-sigma of a wrong focal length
+GIMBAL_PAST = 3000  # reports that are kept: a minute at 50 Hz
 DOUBLED_SUFFIX = "again"  # appended to the file name of a doubled picture
 
 Edit = Callable[[Iterator[Shot]], Iterator[Shot]]
@@ -223,6 +225,41 @@ def late_telemetry(lag_s: float) -> Edit:
             imu += [msgspec.structs.replace(i, t_ns=i.t_ns + lag_ns) for i in shot.imu]
             due_ns = shot.frame.t_ns
             yield replace(shot, states=_due(states, due_ns), imu=_due(imu, due_ns))
+
+    return edit
+
+
+def never(_since_s: float) -> float:
+    return 0.0
+
+
+def gimbal_reports(
+    span: Span, *, age_s: Callable[[float], float] = never, up_deg: Callable[[float], float] = never
+) -> Edit:
+    """In ``span`` a gimbal reports what was ``age_s`` ago (inf: nothing), with a view ``up_deg`` above the true one.
+    Both by the seconds since the beginning."""
+
+    def edit(shots: Iterator[Shot]) -> Iterator[Shot]:
+        past: deque[GimbalAttitude] = deque(maxlen=GIMBAL_PAST)
+
+        def reported(message: Message) -> Message | None:
+            if not isinstance(message, GimbalAttitude):
+                return message
+            past.append(message)
+            t_s = message.t_ns / 1e9
+            if not span.has(t_s):
+                return message
+            since_s = t_s - max(span.from_s, past[0].t_ns / 1e9)
+            then_s = t_s - age_s(since_s)
+            seen = next((old for old in reversed(past) if old.t_ns / 1e9 <= then_s), None)
+            if seen is None:
+                return None
+            up = exp_so3(np.array([0.0, math.radians(up_deg(since_s)), 0.0]))
+            return msgspec.structs.replace(seen, t_ns=message.t_ns, q=quat_from_rot(rot_from_quat(seen.q) @ up))
+
+        for shot in shots:
+            others = (reported(message) for message in shot.others)
+            yield replace(shot, others=tuple(message for message in others if message is not None))
 
     return edit
 

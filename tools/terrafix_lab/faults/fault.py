@@ -43,6 +43,7 @@ class Need(StrEnum):
     DECK = "a start on a deck that moves"
     ELSEWHERE = "pictures of another place"
     MEMORY_GROUP = "a control group of memory"
+    GIMBAL = "a camera on a gimbal that reports its attitude"
 
 
 ROOT = frozenset({Need.DISK, Need.SHARED_MEMORY, Need.MEMORY_GROUP})
@@ -115,8 +116,8 @@ class Fault:
 
 
 CAMPAIGNS = {  # command -> what its driver has
-    "terrafix accept --scenario": frozenset({Need.MATCHES, Need.PIXELS, Need.SEARCH, Need.UNKNOWN}),
-    "terrafix montecarlo --fault": frozenset({Need.MATCHES, Need.UNKNOWN}),
+    "terrafix accept --scenario": frozenset({Need.GIMBAL, Need.MATCHES, Need.PIXELS, Need.SEARCH, Need.UNKNOWN}),
+    "terrafix montecarlo --fault": frozenset({Need.GIMBAL, Need.MATCHES, Need.UNKNOWN}),
     "terrafix chaos --fault": frozenset(Need) - {Need.MATCHES, Need.UNKNOWN},
 }
 

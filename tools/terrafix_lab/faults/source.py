@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from terrafix.messages import Frame, Origin, VehicleState
+from terrafix.messages import Frame, GimbalAttitude, Origin, VehicleState
 from terrafix.vision.sources import Shot, Source
 from terrafix_lab.faults.edits import Edit, OriginEdit, unchanged, unchanged_origin
 from terrafix_lab.sim.interfaces import Readings, Sensors, State
@@ -72,8 +72,8 @@ class Stepwise:
 
 
 class EditedSensors:
-    """Sensors whose attitude, heading and height pass through an edit of telemetry, as those of an autopilot with the
-    fault."""
+    """Sensors whose attitude, heading, height and gimbal pass through an edit of telemetry, as those of an autopilot
+    with the fault."""
 
     def __init__(self, sensors: Sensors) -> None:
         self._sensors = sensors
@@ -99,7 +99,10 @@ class EditedSensors:
             roll_rad=true.roll_rad,
             agl_m=state.agl_m,
         )
-        shot = stepwise(Shot(Frame(t_ns=t_ns, frame_id=0, file="", width=0, height=0), (reported,), None))
+        held = () if true.gimbal is None else (GimbalAttitude(t_ns=t_ns, q=true.gimbal, from_north=True),)
+        frame = Frame(t_ns=t_ns, frame_id=0, file="", width=0, height=0)
+        shot = stepwise(Shot(frame, (reported,), None, others=held))
+        true = replace(true, gimbal=next((m.q for m in shot.others if isinstance(m, GimbalAttitude)), None))
         self._newest = shot.states[-1] if shot.states else self._newest
         if self._newest is None:
             return true

@@ -1,6 +1,7 @@
 """The table of faults. Acceptance, Monte Carlo and the fault matrix name its rows, as far as their driver has what a
 row needs: `terrafix accept --scenario`, `terrafix montecarlo --fault`, `terrafix chaos --fault`."""
 
+import math
 from collections.abc import Callable
 from functools import partial, reduce
 from itertools import accumulate, pairwise
@@ -284,6 +285,49 @@ STREAMED = (  # as a stream or its receiver fails in flight
         cause="focal",
     ),
 )
+
+
+def gimbal(
+    name: str,
+    words: str,
+    telemetry: Callable[[Span], Edit],
+    source: Callable[[Span], Edit] | None = None,
+    *,
+    is_true: bool = False,
+) -> Fault:
+    return Fault(f"gimbal {name}", words, 20.0, source, telemetry, needs=frozenset({Need.GIMBAL}), is_true=is_true)
+
+
+GIMBAL = (
+    gimbal(
+        "not reported",
+        "For 20 s the gimbal reports nothing.",
+        partial(edits.gimbal_reports, age_s=lambda _: math.inf),
+        is_true=True,
+    ),
+    gimbal(
+        "reported late",
+        "For 20 s the reports of the gimbal are half a second old.",
+        partial(edits.gimbal_reports, age_s=lambda _: 0.5),
+    ),
+    gimbal(
+        "frozen",
+        "For 20 s the gimbal reports one attitude.",
+        partial(edits.gimbal_reports, age_s=lambda since_s: since_s),
+    ),
+    gimbal(
+        "drifts",
+        "For 20 s the tilt that is reported drifts by a quarter of a degree a second.",
+        partial(edits.gimbal_reports, up_deg=lambda since_s: 0.25 * since_s),
+    ),
+    gimbal(
+        "looks away",
+        "For 20 s the gimbal holds the camera at the horizon, and says so; what it sees is not on the map.",
+        partial(edits.gimbal_reports, up_deg=lambda _: 90.0),
+        shown(pictures.mirrored),
+        is_true=True,
+    ),
+)
 LIVE = (  # which need a rig
     Fault(
         "pictures of another place",
@@ -327,7 +371,17 @@ SCENARIOS: tuple[Fault, ...] = (  # of several faults
 MATRIX = (NONE, *KILLED_AND_LIMITED, *CAMERA, *AROUND_THEM)  # what `terrafix chaos` flies if no fault is named
 FAULTS = {
     fault.name: fault
-    for fault in (*MATRIX, *FALSE_INPUTS, *STREAMED, *LIVE, *SCARCE_INPUTS, *IMPRECISE_INPUTS, *MATCHES, *SCENARIOS)
+    for fault in (
+        *MATRIX,
+        *FALSE_INPUTS,
+        *STREAMED,
+        *GIMBAL,
+        *LIVE,
+        *SCARCE_INPUTS,
+        *IMPRECISE_INPUTS,
+        *MATCHES,
+        *SCENARIOS,
+    )
 }
 
 

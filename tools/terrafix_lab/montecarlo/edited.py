@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
-from terrafix.messages import Frame, Imu, VehicleState
+from terrafix.messages import Frame, GimbalAttitude, Imu, VehicleState
 from terrafix.vision.sources import Shot as SourceShot
 from terrafix_lab.faults.fault import Fault
 from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight
@@ -24,7 +24,7 @@ def edited(flown: SimulatedFlight, fault: Fault) -> SimulatedFlight:
         flown,
         frames=frames,
         pictures=pictures,
-        telemetry=[sorted((*shot.states, *shot.imu), key=lambda message: message.t_ns) for shot in found],
+        telemetry=[sorted((*shot.states, *shot.imu, *shot.others), key=lambda message: message.t_ns) for shot in found],
         path_m=np.interp([shot.t_s for shot in frames], times_s, flown.path_m),
         lie=None if fault.is_true else span,
     )
@@ -36,7 +36,8 @@ def _given(flown: SimulatedFlight, i: int) -> SourceShot:
     frame = Frame(t_ns=round(1e9 * picture.t_s), frame_id=i, file=str(i), width=camera.width, height=camera.height)
     states = tuple(message for message in flown.telemetry[i] if isinstance(message, VehicleState))
     imu = tuple(message for message in flown.telemetry[i] if isinstance(message, Imu))
-    return SourceShot(frame, states, picture, imu)  # type: ignore[arg-type]  # a Sight instead of pixels
+    held = tuple(message for message in flown.telemetry[i] if isinstance(message, GimbalAttitude))
+    return SourceShot(frame, states, picture, imu, held)  # type: ignore[arg-type]  # a Sight instead of pixels
 
 
 def _picture(shot: SourceShot, true: Shot) -> Shot:

@@ -12,7 +12,7 @@ import numpy as np
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pose import exp_so3, log_so3
-from terrafix.messages import Message, Origin, VehicleState
+from terrafix.messages import GimbalAttitude, Message, Origin, VehicleState
 from terrafix_lab.faults.edits import Span
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.ground import Terrain
@@ -36,6 +36,7 @@ CLIMBS = 0.25  # 1-sigma of a waypoint's height, as a share of the flight's
 MIN_AGL_M = 60.0
 TELEMETRY_EVERY, SLOW_EVERY = 2, 5  # steps: attitude at 25 Hz with inertial readings, 10 Hz without
 IMU_BATCH = 5  # readings in a message, at 50 Hz
+GIMBAL_EVERY = 10  # steps: reports at 5 Hz [spec: STREAMS_HZ]
 YAW_SIGMA_DEG, AGL_SIGMA_M, ATTITUDE_SIGMA_DEG = 3.0, 3.0, 0.7  # as `terrafix sim make` states them
 
 
@@ -46,7 +47,7 @@ class Shot:
     t_s: float
     p_m: np.ndarray  # (3,) of the camera, which is at the origin of the body
     r_w_c: np.ndarray  # (3, 3)
-    r_w_b: np.ndarray  # (3, 3) of the body, or of the stabilised frame of a gimbal
+    r_w_b: np.ndarray  # (3, 3) of the body, or of the stabilised frame of a gimbal that reports nothing
     velocity_mps: np.ndarray  # (3,)
     scale: tuple[float, float] = (1.0, 1.0)  # of the picture's content about its centre; negative: mirrored
     dark: bool = False  # the picture shows nothing
@@ -93,8 +94,8 @@ def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
     frame = LocalFrame(LAT_DEG, LON_DEG)
     vehicle = _vehicle(plan, terrain, frame)
     errors = SensorErrors(yaw_constant_rad=plan.compass_rad)
-    sensors = VehicleSensors(frame, seed=plan.seed, errors=errors, airspeed=plan.kind is Kind.PLANE)
     hanging = Gimbal(seed=plan.seed) if plan.gimbal else Fixed()
+    sensors = VehicleSensors(frame, seed=plan.seed, errors=errors, airspeed=plan.kind is Kind.PLANE)
     r_b_c = Mount.of(plan.camera).r_b_c()
     tilt = exp_so3(np.array([*plan.mount_error_rad, 0.0]))
     claimed = vehicle.state.p_b_in_w_m[:2] + np.array(plan.start_error_m)
@@ -111,7 +112,8 @@ def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
     def shot(at: State) -> Shot:
         held = hanging.r_w_c(at)
         p_m = at.p_b_in_w_m - np.array([*claimed, 0.0])
-        return Shot(at.t_s, p_m, held @ tilt, held @ r_b_c.T, at.velocity_enu_mps)
+        r_w_b = at.r_w_b() if plan.gimbal_reports else held @ r_b_c.T
+        return Shot(at.t_s, p_m, held @ tilt, r_w_b, at.velocity_enu_mps)
 
     steps = flown(
         vehicle,
@@ -124,6 +126,8 @@ def fly(plan: FlightPlan, terrain: Terrain) -> SimulatedFlight:
     for i, (state, sent) in enumerate(steps):
         path_m += float(np.hypot(*state.velocity_enu_mps[:2])) * STEP_S if i else 0.0
         waiting += sent
+        if plan.gimbal_reports and i % GIMBAL_EVERY == 0:
+            waiting.append(_gimbal_attitude(hanging, state))
         if i % frame_every == 0:
             frames.append(shot(state))
             pictures.append(replace(taken or frames[-1], t_s=state.t_s))
@@ -160,11 +164,21 @@ def _mission(plan: FlightPlan, frame: LocalFrame) -> Mission:
 
 
 def _vehicle_state(plan: FlightPlan, readings: Readings, home_m: float) -> VehicleState:
-    """As the link publishes it. With a gimbal the roll and pitch of the camera are not reported."""
+    """As the link publishes it. Roll and pitch of a camera on a gimbal that reports nothing are unknown."""
     state = vehicle_state(readings, home_m)
     assert state.agl_m is not None
     state = msgspec.structs.replace(state, agl_m=plan.height_scale * state.agl_m)
-    return msgspec.structs.replace(state, pitch_rad=None, roll_rad=None) if plan.gimbal else state
+    return (
+        msgspec.structs.replace(state, pitch_rad=None, roll_rad=None)
+        if plan.gimbal and not plan.gimbal_reports
+        else state
+    )
+
+
+def _gimbal_attitude(hanging: Fixed | Gimbal, state: State) -> GimbalAttitude:
+    q = hanging.reported(state)
+    assert q is not None
+    return GimbalAttitude(t_ns=round(state.t_s * 1e9), q=q, from_north=True)
 
 
 def _origin(plan: FlightPlan, home_m: float) -> Origin:

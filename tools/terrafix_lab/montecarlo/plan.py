@@ -5,9 +5,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from terrafix.map.format import CE90_SIGMAS
-from terrafix.messages import Camera
+from terrafix.messages import Camera, Gimbal
+from terrafix_lab.faults.fault import Need
+from terrafix_lab.faults.table import FAULTS
 from terrafix_lab.montecarlo.fault import LIES, DrawnFault
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.vehicle.wind import Wind
@@ -69,6 +72,7 @@ class FlightPlan:
     has_imu: bool  # the autopilot streams inertial readings
     mount_error_rad: tuple[float, float]  # about the camera's x and y
     gimbal: bool
+    gimbal_reports: bool
     map_sigma_m: float  # stated by the map package
     map_offset_m: tuple[float, float]
     start_sigma_m: float
@@ -91,9 +95,10 @@ def plan(
     flight, in addition to its fault."""
     rng = np.random.default_rng([run_seed, number, 50])
     chosen = ROUND[number % len(ROUND)] if fault is None else fault
-    kind = Kind.PLANE if rng.uniform() < 0.5 else Kind.COPTER
+    reports = chosen in FAULTS and Need.GIMBAL in FAULTS[chosen].needs
+    kind = Kind.PLANE if rng.uniform() < 0.5 and not reports else Kind.COPTER
     width, height, focal = CAMERAS[int(rng.integers(len(CAMERAS)))]
-    gimbal = kind is Kind.COPTER and rng.uniform() < 0.5
+    gimbal = kind is Kind.COPTER and (rng.uniform() < 0.5 or reports)
     tolerance_deg = float(rng.choice([2.0, 5.0]))
     tilt = np.radians(tolerance_deg) * rng.normal(size=2)
     wind_mps, wind_from = float(rng.uniform(0.0, 8.0)), float(rng.uniform(0.0, 2.0 * math.pi))
@@ -114,12 +119,13 @@ def plan(
         hills_m=hills_m,
         settled=float(rng.uniform(0.02, 0.35)),
         has_dem=hills_m > FLAT_M or bool(rng.uniform() < 0.5),
-        camera=_camera(width, height, focal, tolerance_deg),
+        camera=_camera(width, height, focal, tolerance_deg, reports),
         has_imu=bool(number % 2),
         focal_error=float(rng.normal(0.0, FOCAL_SIGMA)),
         k1_error=float(rng.normal(0.0, K1_SIGMA)),
         mount_error_rad=(float(tilt[0]), float(tilt[1])),
         gimbal=gimbal,
+        gimbal_reports=reports,
         map_sigma_m=ce90_m / CE90_SIGMAS,
         map_offset_m=_map_offset(run_seed, number, ce90_m / CE90_SIGMAS),
         start_sigma_m=start_sigma_m,
@@ -131,7 +137,7 @@ def plan(
     return _with_fault(drawn, sign, rng)
 
 
-def _camera(width: int, height: int, focal_px: float, mount_tolerance_deg: float) -> Camera:
+def _camera(width: int, height: int, focal_px: float, mount_tolerance_deg: float, gimbal: bool) -> Camera:
     return Camera(
         width=width,
         height=height,
@@ -141,6 +147,7 @@ def _camera(width: int, height: int, focal_px: float, mount_tolerance_deg: float
         cy=(height - 1) / 2,
         focal_sigma=FOCAL_SIGMA,
         mount_tolerance_deg=mount_tolerance_deg,
+        gimbal=Gimbal() if gimbal else UNSET,
     )
 
 

@@ -150,7 +150,9 @@ def make(
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
     """Write a flight folder of a simulated vehicle: images, telemetry.tlog, truth.csv and the map."""
+    from terrafix.vision.sources.description import camera_of, read_description
     from terrafix_lab.sim.flights import make as making
+    from terrafix_lab.sim.flights.folder import CAMERA
 
     wanted = making.FlightOptions(
         seed=seed,
@@ -167,7 +169,7 @@ def make(
         agl_m=agl,
         events=events,
         jam_after_s=jam_after,
-        camera=camera,
+        camera=CAMERA if camera is None else camera_of(camera, read_description(camera)),
     )
     flight = making.make(out, wanted, progress=not quiet)
     length_m = flight.path.length_m(flight.duration_s)

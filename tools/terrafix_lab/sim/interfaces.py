@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from terrafix.core.geodesy import rot_w_b
+from terrafix.messages import Quat
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ class Readings:
     airspeed_mps: float | None
     range_m: float | None
     gnss: GnssFix | None
+    gimbal: Quat | None = None  # attitude that a gimbal reports, of its axes into north, east, down
 
 
 class Vehicle(Protocol):

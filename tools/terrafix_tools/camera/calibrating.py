@@ -69,7 +69,8 @@ def calibrate(views: Sequence[BoardView], size: tuple[int, int], board: Board, m
     used = [view for view in views if len(view.ids) >= MIN_CORNERS]
     lacks = _uncovered(used, size, model)
     if len(used) < MIN_VIEWS:
-        lacks.insert(0, f"{MIN_VIEWS - len(used)} more images with the board (it was found in {len(used)})")
+        found = len(used) or "none; is it the one of --board, all of its squares counted?"
+        lacks.insert(0, f"{MIN_VIEWS - len(used)} more images with the board (it was found in {found})")
     if len(used) < 4:
         raise _refused(lacks)
     try:

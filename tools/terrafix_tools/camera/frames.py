@@ -65,7 +65,8 @@ def _images(sources: Sequence[str]) -> Iterator[tuple[str, np.ndarray, bool]]:
             for file in files:
                 image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
                 if image is None:
-                    raise SourceError(f"{file}: cannot be read as an image")
+                    missing = "cannot be read as an image" if file.exists() else "no such file or folder"
+                    raise SourceError(f"{file}: {missing}")
                 yield file.name, image, False
 
 

@@ -2,7 +2,10 @@
 
 The camera counts as fixed to a platform in the way that [mount] says. With a fixed mount the platform is the vehicle;
 on a gimbal it is what the gimbal holds, level with its front along the vehicle's while the camera looks as [mount]
-says. The attitude of a frame is that of the platform, so estimator and monitors know one kind of mount."""
+says. The attitude of a frame is that of the platform, so estimator and monitors know one kind of mount.
+
+By MAVLink roll and pitch of a report are against the horizon. Of a mount with servos (MNT1_TYPE 1) ArduPilot reports,
+with the same flags, their angles: the opposite of the vehicle's lean. Such reports do not measure the camera."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -17,6 +20,9 @@ BUFFER_REPORTS = 300  # 30 s at 10 Hz; the time offset looks back by less [spec:
 # 1-sigma of the time of a report against that of the frame: one interval of the requested rate.
 LATENCY_S = 0.1  # [spec: STREAMS_HZ of link/mavlink/message_rates.py]
 FROZEN_NS = 1_000_000_000  # reports without a change for so long are not measured [spec: MAX_GAP_NS of attitudes]
+# Evidence, nats, for reports that are the opposite of the vehicle's lean. [spec: as for a pose, consensus_pose.py]
+DECISIVE = 9.0
+TILT_RAD = np.radians(2.0)  # 1-sigma of a reported tilt [spec: LEANS_RAD of telemetry_buffer.py]
 # Least down component of the view that sees ground for a map match. [spec: MIN_DOWN_COMPONENT of vision/sources]
 MIN_VIEW_DOWN = 0.2
 # Camera axes in those of the gimbal. [spec: OpenCV; MAVLink gimbal frame]
@@ -43,6 +49,8 @@ class GimbalReports:
         self._r_c_p = LOOKING_ALONG_X @ Mount().r_b_c().T
         self._reports: deque[GimbalAttitude] = deque(maxlen=BUFFER_REPORTS)
         self._changed_ns = 0  # time of the newest report that differs from the one before
+        self._compared: tuple[int, float, float] | None = None  # time, pitch of platform and vehicle
+        self._opposite = self._held = 0.0  # nats for reports opposite to the vehicle's pitch, and for a level platform
 
     def describe(self, camera: Camera) -> None:
         """``camera``: as the flight describes it."""
@@ -59,8 +67,8 @@ class GimbalReports:
         """The axes that the gimbal holds level."""
         return () if self.gimbal is None else self.gimbal.stabilised
 
-    def add(self, report: GimbalAttitude) -> None:
-        """A report. Another device than the camera's does not count."""
+    def add(self, report: GimbalAttitude, pitch_rad: float | None) -> None:
+        """A report. Another device than the camera's does not count. ``pitch_rad``: of the vehicle then, if known."""
         wanted, newest = self.gimbal.device if self.gimbal else 0, self._reports[-1] if self._reports else None
         if report.device != (wanted or (newest.device if newest else report.device)):
             return
@@ -71,6 +79,31 @@ class GimbalReports:
         if newest is not None and newest.from_north is not report.from_north:
             self._reports.clear()
         self._reports.append(report)
+        if pitch_rad is not None:
+            self._compare(report, pitch_rad)
+
+    def _compare(self, report: GimbalAttitude, pitch_rad: float) -> None:
+        """Log likelihood ratio of the changes within FROZEN_NS, summed as a CUSUM test (Page 1954): a servo at its
+        limit does not move."""
+        held_rad = float(euler_of(_product(np.array([report.q]), np.array([quat_from_rot(self._r_c_p)])))[1, 0])
+        if self._compared is not None and report.t_ns - self._compared[0] < FROZEN_NS:
+            return
+        if self._compared is not None:
+            turned_rad, leant_rad = held_rad - self._compared[1], pitch_rad - self._compared[2]
+            nats = float((turned_rad**2 - (turned_rad + leant_rad) ** 2) / (4.0 * TILT_RAD**2))
+            self._opposite = min(max(self._opposite + nats, 0.0), 2.0 * DECISIVE)
+            self._held = max(self._held - nats, 0.0)
+        self._compared = report.t_ns, held_rad, pitch_rad
+
+    @property
+    def opposes(self) -> bool:
+        """Its reports are the opposite of the vehicle's lean."""
+        return self._opposite >= DECISIVE
+
+    @property
+    def is_level(self) -> bool:
+        """Its reports were seen not to follow the vehicle's lean."""
+        return self._held >= DECISIVE
 
     @property
     def unchanged_since_ns(self) -> int | None:

@@ -13,7 +13,7 @@ from terrafix.core.inertial import GRAVITY_MPS2, covers, integrated, rotate_to_w
 from terrafix.core.pose import log_so3, small_turns
 from terrafix.estimator.measurements.gimbal import GimbalReports, euler_of
 from terrafix.estimator.models.motion_model import WorldAcceleration
-from terrafix.messages import Imu, VehicleState
+from terrafix.messages import GimbalAttitude, Imu, VehicleState
 
 TURN_UNSEEN_RAD = 0.3  # 1-sigma of the change of an unreported heading up to an unseen frame [tuned]
 # 1-sigma of unreported roll and pitch: a copter in cruise tilts by 10 to 20 degrees, a plane banks as much in a turn
@@ -89,15 +89,22 @@ class Telemetry:
             self._forces.add(imu.t_ns - before_ns, forward, right, down)
             self._rates.add(imu.t_ns - before_ns, *rates)
 
+    def add_gimbal(self, report: GimbalAttitude) -> None:
+        turns = self._turns.around(report.t_ns - MAX_ATTITUDE_GAP_NS, report.t_ns)
+        known = turns is not None and np.abs(turns[0] - report.t_ns).min() <= MAX_ATTITUDE_GAP_NS
+        self.gimbal.add(report, float(np.interp(report.t_ns, turns[0], turns[1][1])) if turns and known else None)
+
     def at(self, t_ns: int) -> Attitude:
         """What the camera is fixed to at ``t_ns``: the vehicle, or what its gimbal holds (gimbal.py)."""
         vehicle = self._vehicle_at(t_ns)
         return self._platform_at(t_ns, vehicle) if self.gimbal.used else vehicle
 
     def _platform_at(self, t_ns: int, vehicle: Attitude) -> Attitude:
-        """A gimbal that reports nothing, or nothing new while the vehicle leans, holds the stabilised axes level to
-        UNKNOWN_ATTITUDE_RAD; the others lean as the vehicle does."""
-        held, yaw_rad, pitch_rad, roll_rad = self.gimbal.at(t_ns), vehicle.yaw_rad, vehicle.pitch_rad, vehicle.roll_rad
+        """A gimbal that reports nothing, nothing new while the vehicle leans, or the opposite of that lean, holds the
+        stabilised axes level to UNKNOWN_ATTITUDE_RAD; the others lean as the vehicle does. A report may be off by that
+        lean until it was seen to be level."""
+        held = None if self.gimbal.opposes else self.gimbal.at(t_ns)
+        yaw_rad, pitch_rad, roll_rad = vehicle.yaw_rad, vehicle.pitch_rad, vehicle.roll_rad
         body = None if yaw_rad is None or pitch_rad is None or roll_rad is None else (yaw_rad, pitch_rad, roll_rad)
         platform = replace(vehicle, vehicle=body, sees_ground=held is None or held.sees_ground)
         angles = np.zeros(3) if held is None else euler_of(held.q[None])[:, 0]
@@ -111,14 +118,15 @@ class Telemetry:
             if not (pitches or rolls):
                 return replace(lost, pitch_rad=None, roll_rad=None)
             return replace(lost, pitch_rad=pitch_rad if pitches else 0.0, roll_rad=roll_rad if rolls else 0.0)
+        leans_rad = 0.0 if self.gimbal.is_level else float(np.hypot(vehicle.pitch_rad or 0.0, vehicle.roll_rad or 0.0))
         return replace(
             platform,
             yaw_rad=yaw_rad,
             pitch_rad=float(angles[1]),
             roll_rad=float(angles[2]),
             stale_s=max(vehicle.stale_s, max(0, held.age_ns - MAX_ATTITUDE_GAP_NS // 2) * 1e-9),
-            righted_rad=held.turns_rad,
-            turned_rad=held.turns_rad,
+            righted_rad=float(np.hypot(held.turns_rad, leans_rad)),
+            turned_rad=float(np.hypot(held.turns_rad, leans_rad)),
         )
 
     def _repeats(self) -> bool:

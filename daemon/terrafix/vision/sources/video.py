@@ -139,8 +139,8 @@ class Video:
             if where.is_file():
                 return where
         raise SourceError(
-            f"{self.path}: a video does not say which camera took it; write {self.path.stem}.toml beside it with "
-            "[camera] and [start]"
+            f"{self.path}: a video does not say which camera took it; 'terrafix camera calibrate', 'import' or 'init' "
+            f"writes its description, with --out {self.path.with_suffix('.toml')}"
         )
 
     def _stated(self) -> list[VehicleState]:

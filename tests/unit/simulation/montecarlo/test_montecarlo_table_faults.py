@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafix.core.errors import UsageError
-from terrafix.messages import VehicleState, Verdict
+from terrafix.messages import Gimbal, GimbalAttitude, VehicleState, Verdict
 from terrafix_lab.faults import pictures
 from terrafix_lab.faults.table import FAULTS, in_turn
 from terrafix_lab.montecarlo.edited import edited
@@ -16,6 +16,7 @@ from terrafix_lab.montecarlo.flown import SimulatedFlight, fly
 from terrafix_lab.montecarlo.ground import Terrain
 from terrafix_lab.montecarlo.plan import plan
 from terrafix_lab.montecarlo.run import FLYABLE, fault_of
+from terrafix_lab.sim.autopilot.parameters import Kind
 
 SHORT_S = 60.0
 TRUE = plan(5, 1, fault=DrawnFault.NONE, duration_s=SHORT_S)
@@ -103,3 +104,11 @@ def test_outlier_fixes_of_the_table_are_rejected_by_the_estimator() -> None:
     honest, wrong = run(TRUE), run(plan(5, 1, fault="350 m outlier fix", duration_s=SHORT_S))
     assert wrong.fixes.get(Verdict.INNOVATION, 0) >= honest.fixes.get(Verdict.INNOVATION, 0) + 5
     assert np.hypot(*wrong.error_m[:, :2].T).max() < 60.0
+
+
+def test_a_fault_of_a_gimbal_is_flown_by_a_copter_whose_camera_is_on_one_that_reports() -> None:
+    drawn = plan(5, 2, fault="gimbal not reported", duration_s=50.0)
+    flown = edited(fly(drawn, Terrain(drawn.seed, 1.0, drawn.settled)), FAULTS[drawn.fault])
+    assert drawn.kind is Kind.COPTER and isinstance(flown.origin.camera.gimbal, Gimbal)
+    reported_s = np.array([m.t_ns / 1e9 for sent in flown.telemetry for m in sent if isinstance(m, GimbalAttitude)])
+    assert np.diff(reported_s).max() == pytest.approx(20.0, abs=0.5) and np.median(np.diff(reported_s)) < 0.21

@@ -23,6 +23,7 @@ from terrafix_lab.sim.autopilot.course import Course, CourseFollower
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.autopilot.parameters import GPS_INPUT_ALONE, NO_DCM, Kind
 from terrafix_lab.sim.autopilot.report import PeerMonitor, PeerReport, ReceivedFix
+from terrafix_lab.sim.camera.mount import FIXED, CameraMount
 from terrafix_lab.sim.interfaces import Navigation, navigation_of
 from terrafix_lab.sim.sensors.clock import Clock
 from terrafix_lab.sim.sensors.suite import VehicleSensors
@@ -59,10 +60,11 @@ class AutopilotPeer:
         parameters: dict[str, float] | None = None,
         home_amsl_m: float | None = None,
         log: Path | None = None,
+        mount: CameraMount = FIXED,
     ) -> None:
-        """``log``: telemetry log (.tlog) of what it sends, as a ground station keeps it. Raises UsageError for an
-        unknown parameter."""
-        self._log = log
+        """``log``: telemetry log (.tlog) of what it sends, as a ground station keeps it. ``mount``: of the camera, as
+        whose gimbal it reports. Raises UsageError for an unknown parameter."""
+        self._log, self._mount = log, mount
         self._parameters = GPS_INPUT_ALONE | NO_DCM | (parameters or {})
         self._seed, self._aligned, self._sysid, self._home_amsl_m = seed, aligned, sysid, home_amsl_m
         self._kind = kind
@@ -159,7 +161,7 @@ class AutopilotPeer:
             boot_ns=Clock.of(self._seed).boot_ns,
         )
         self._sensors = EditedSensors(
-            VehicleSensors(frame, seed=self._seed, airspeed=not math.isnan(first.airspeed_mps))
+            VehicleSensors(frame, seed=self._seed, airspeed=not math.isnan(first.airspeed_mps), mount=self._mount)
         )
         self._monitor = PeerMonitor(self._autopilot, frame)
 

@@ -8,6 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.mavlink.gimbal import IN_EARTH, YAW_LOCK
 from terrafix_lab.sim.autopilot.navigation.gps import GpsInstance
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.interfaces import Navigation, Readings
@@ -26,6 +27,7 @@ RATES_HZ = {  # default rates; 0: only on request
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
     mavlink.MAVLINK_MSG_ID_AIRSPEED: 2.0,
     mavlink.MAVLINK_MSG_ID_TIMESYNC: 0.1,
+    mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 0.0,
 }
 HEADING_UNKNOWN = 65535
 _UINT16_MAX, _UINT32_MAX = 65535, 0xFFFF_FFFF
@@ -89,6 +91,10 @@ def message(message_id: int, now: Snapshot) -> Any | None:
             return _airspeed(now)
         case mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
             return mavlink.MAVLink_system_time_message(now.unix_us, now.boot_ms)
+        case mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS:
+            q, still = now.readings.gimbal, (0.0, 0.0, 0.0)
+            flags = YAW_LOCK | IN_EARTH
+            return q and mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, now.boot_ms, flags, q, *still, 0)
         case _:
             return mavlink.MAVLink_timesync_message(0, now.boot_ns)
 

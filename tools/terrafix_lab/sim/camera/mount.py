@@ -5,9 +5,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from msgspec import UnsetType
 
 from terrafix.core.camera import Mount
-from terrafix.core.geodesy import rot_w_b
+from terrafix.core.geodesy import euler_from_rot, rot_w_b
+from terrafix.core.mavlink.gimbal import quat_from_euler
+from terrafix.estimator.measurements.gimbal import LOOKING_ALONG_X
+from terrafix.messages import Camera, Quat
 from terrafix_lab.sim.interfaces import State
 
 DOWN = Mount()
@@ -39,6 +43,9 @@ class CameraMount(Protocol):
 
     def motion(self, state: State) -> CameraMotion: ...
 
+    def reported(self, state: State) -> Quat | None:
+        """Attitude that a gimbal reports, of its axes into north, east, down; None: the camera is on none."""
+
 
 @dataclass(frozen=True)
 class Fixed:
@@ -51,6 +58,12 @@ class Fixed:
 
     def motion(self, state: State) -> CameraMotion:
         return CameraMotion(state.velocity_enu_mps, self.mount.r_b_c().T @ state.rates_b_radps)
+
+    def reported(self, state: State) -> None:
+        return None
+
+
+FIXED = Fixed()
 
 
 @dataclass(frozen=True)
@@ -73,3 +86,11 @@ class Gimbal:
         _, q, r = (float(v) for v in state.rates_b_radps)
         yaw_rate_radps = (q * math.sin(state.roll_rad) + r * math.cos(state.roll_rad)) / math.cos(state.pitch_rad)
         return CameraMotion(state.velocity_enu_mps, self.r_w_c(state).T @ np.array([0.0, 0.0, -yaw_rate_radps]))
+
+    def reported(self, state: State) -> Quat:
+        return quat_from_euler(*euler_from_rot(self.r_w_c(state) @ LOOKING_ALONG_X.T))
+
+
+def mount_of(camera: Camera) -> Fixed | Gimbal:
+    """As the description of a camera says."""
+    return (Fixed if isinstance(camera.gimbal, UnsetType) else Gimbal)(Mount.of(camera))

@@ -10,16 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
-from msgspec import UnsetType
 
 from terrafix import messages as m
-from terrafix.core.camera import Mount
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix.core.geodesy import LocalFrame, euler_from_rot
-from terrafix.core.mavlink.gimbal import quat_from_euler
-from terrafix.estimator.measurements.gimbal import LOOKING_ALONG_X
-from terrafix.messages import Quat
+from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.sources.description import (
     CameraTable,
     Description,
@@ -29,7 +25,7 @@ from terrafix.vision.sources.description import (
 )
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.autopilot.parameters import Kind
-from terrafix_lab.sim.camera.mount import Fixed, Gimbal
+from terrafix_lab.sim.camera.mount import CameraMount, mount_of
 from terrafix_lab.sim.camera.render import Film, Ground, Renderer
 from terrafix_lab.sim.flights.log import T0_US, TelemetryLog
 from terrafix_lab.sim.flights.path import FlownPath, fly
@@ -49,8 +45,8 @@ from terrafix_tools.mission.items import Mission, check
 CAMERA = m.Camera(
     width=960, height=540, fx=560.0, fy=560.0, cx=479.5, cy=269.5, focal_sigma=0.01, mount_tolerance_deg=1.0
 )
+ON_GIMBAL = msgspec.structs.replace(CAMERA, gimbal=m.Gimbal())
 FRAME_HZ = 2.0
-GIMBAL_S = 0.2  # between two reports [spec: STREAMS_HZ]
 JPEG_QUALITY = 92
 AGL_M = 130.0
 EDGE_MARGIN_PER_AGL = 1.3  # distance of the course from the edge of the image, in heights: the camera's reach
@@ -87,28 +83,24 @@ class Flight:
         return np.arange(math.floor(self.duration_s * self.frame_hz + 1e-6)) / self.frame_hz
 
     @property
-    def mount(self) -> Fixed | Gimbal:
-        """Fixed to the vehicle, or a gimbal, as the description of the camera says."""
-        kind = Fixed if isinstance(self.camera.gimbal, UnsetType) else Gimbal
-        return kind(Mount.of(self.camera))
+    def mount(self) -> CameraMount:
+        return mount_of(self.camera)
 
     def camera_pose(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Returns p_c_in_w_m (3,) and R_w_c (3, 3)."""
         return state.p_b_in_w_m, self.mount.r_w_c(state)
 
-    def gimbal_attitudes(self) -> list[tuple[float, Quat]]:
-        """Time and attitude of each report of the gimbal; empty where the camera is fixed."""
-        if isinstance(self.camera.gimbal, UnsetType):
-            return []
-        times_s, mount = np.arange(0.0, self.duration_s, GIMBAL_S), self.mount
-        held = ((t_s, mount.r_w_c(self.path.state(t_s)) @ LOOKING_ALONG_X) for t_s in times_s.tolist())
-        return [(t_s, quat_from_euler(*euler_from_rot(r_w_g))) for t_s, r_w_g in held]
 
-
-def plan_flight(place: World, camera_image_bgr: np.ndarray, duration_s: float, frame_hz: float = FRAME_HZ) -> Flight:
+def plan_flight(
+    place: World,
+    camera_image_bgr: np.ndarray,
+    duration_s: float,
+    frame_hz: float = FRAME_HZ,
+    camera: m.Camera = CAMERA,
+) -> Flight:
     """Plans a fixed-wing flight on a closed course over a generated place, in the season of ``camera_image_bgr``."""
     scene = scene_of_world(place, camera_image_bgr)
-    return replace(flight_over(scene, seed=place.seed, duration_s=duration_s), frame_hz=frame_hz)
+    return replace(flight_over(scene, seed=place.seed, duration_s=duration_s, camera=camera), frame_hz=frame_hz)
 
 
 def mission_over(
@@ -131,6 +123,7 @@ def flight_over(
     duration_s: float | None = None,
     events: Sequence[AnyEvent] = (),
     wind: Wind = BREEZE,
+    camera: m.Camera = CAMERA,
 ) -> Flight:
     """Flies ``mission`` (None: a generated course of sufficient length) for ``duration_s`` (None: until it is
     complete).
@@ -146,7 +139,7 @@ def flight_over(
     vehicle = (Plane if kind is Kind.PLANE else Copter)(mission, scene.frame, height, wind=wind, seed=seed)
     first = vehicle.state
     ground_amsl_m = float(first.p_b_in_w_m[2]) - first.agl_m
-    sensors = VehicleSensors(scene.frame, seed=seed, events=events, airspeed=kind is Kind.PLANE)
+    sensors = VehicleSensors(scene.frame, seed=seed, events=events, airspeed=kind is Kind.PLANE, mount=mount_of(camera))
     navigation = None if mission.starts_on_ground() else navigation_of(first)
     autopilot = SimAutopilot(
         scene.frame,
@@ -174,6 +167,7 @@ def flight_over(
         start_wgs84=scene.frame.to_wgs84(float(start[0]), float(start[1])),
         ground_amsl_m=ground_amsl_m,
         duration_s=duration_s or path.duration_s,
+        camera=camera,
     )
 
 
@@ -212,7 +206,7 @@ def write_flight(
 
 def add_telemetry(folder: Path, flight: Flight) -> None:
     """Writes telemetry.tlog into the folder. Raises OutputError."""
-    flight.telemetry.write(folder / "telemetry.tlog", flight.gimbal_attitudes())
+    flight.telemetry.write(folder / "telemetry.tlog")
 
 
 def truth_row(frame: LocalFrame, state: State) -> list[str]:

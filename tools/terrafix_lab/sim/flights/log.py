@@ -1,14 +1,11 @@
 """telemetry.tlog of a simulated flight: the autopilot's packets as a ground station records them."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.errors import OutputError
-from terrafix.core.mavlink.gimbal import IN_EARTH, YAW_LOCK
 from terrafix.core.mavlink.tlog import record
-from terrafix.messages import Quat
 from terrafix_lab.sim.autopilot.lockstep import SimAutopilot
 from terrafix_lab.sim.interfaces import Readings
 
@@ -20,6 +17,7 @@ RATES_HZ = {  # rates that a companion requests
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_VFR_HUD: 4.0,
     mavlink.MAVLINK_MSG_ID_AIRSPEED: 5.0,
+    mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS: 5.0,
 }
 T0_US = 1_717_236_000_000_000  # 2024-06-01 10:00 UTC, UNIX microseconds of t_s 0
 COMPANION = 190  # MAV_COMP_ID_MISSIONPLANNER
@@ -47,14 +45,9 @@ class TelemetryLog:
         if packets:
             self._records.append((self._t0_us + round(readings.t_s * 1e6), packets))
 
-    def write(self, path: Path, gimbal: Sequence[tuple[float, Quat]] = ()) -> None:
-        """Writes the file. ``gimbal``: seconds, and attitude of the camera in north, east, down. Raises OutputError."""
-        sender, flags, still = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), YAW_LOCK | IN_EARTH, (0.0,) * 3
-        records = list(self._records)
-        for t_s, q in gimbal:
-            status = mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, round(1e3 * t_s), flags, q, *still, 0)
-            records.append((self._t0_us + round(t_s * 1e6), bytes(status.pack(sender))))
+    def write(self, path: Path) -> None:
+        """Writes the file. Raises OutputError."""
         try:
-            path.write_bytes(b"".join(record(*one) for one in sorted(records)))
+            path.write_bytes(b"".join(record(*one) for one in self._records))
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another --out") from None

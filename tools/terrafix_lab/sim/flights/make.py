@@ -1,14 +1,14 @@
 """`terrafix sim make`: a flight folder over generated or real ground, with its map."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
 from terrafix.core.errors import OutputError, UsageError
-from terrafix.vision.sources.description import camera_of, read_description
+from terrafix.messages import Camera
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights.folder import (
     AGL_M,
@@ -50,13 +50,12 @@ class FlightOptions:
     agl_m: float = AGL_M
     events: Path | None = None
     jam_after_s: float | None = None
-    camera: Path | None = None  # its description; None: 960x540 px, 81 degrees wide
+    camera: Camera = CAMERA
 
 
 def make(out: Path, wanted: FlightOptions, *, progress: bool = True) -> Flight:
     """Writes the folder ``out``, which must be new or empty. Raises subclasses of TerrafixError."""
     check_options(wanted)
-    camera = CAMERA if wanted.camera is None else camera_of(wanted.camera, read_description(wanted.camera))
     events = gnss_events(wanted)
     mission = None if wanted.mission is None else read_mission(wanted.mission)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -76,9 +75,14 @@ def make(out: Path, wanted: FlightOptions, *, progress: bool = True) -> Flight:
         )
     with waiting(console, "simulating the flight"):
         flight = flight_over(
-            scene, wanted.vehicle, seed=wanted.seed, mission=mission, duration_s=wanted.duration_s, events=events
+            scene,
+            wanted.vehicle,
+            seed=wanted.seed,
+            mission=mission,
+            duration_s=wanted.duration_s,
+            events=events,
+            camera=wanted.camera,
         )
-    flight = replace(flight, camera=camera)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

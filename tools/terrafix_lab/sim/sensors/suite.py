@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from terrafix.core.geodesy import LocalFrame
+from terrafix_lab.sim.camera.mount import FIXED, CameraMount
 from terrafix_lab.sim.interfaces import Readings, State
 from terrafix_lab.sim.sensors.errors import TYPICAL, SensorErrors
 from terrafix_lab.sim.sensors.gnss import Gnss
@@ -46,10 +47,11 @@ class VehicleSensors:
         events: Sequence[AnyEvent] = (),
         airspeed: bool = True,
         rangefinder: bool = False,
+        mount: CameraMount = FIXED,
     ) -> None:
         rng = np.random.default_rng([seed, 31])
         self._noise = np.random.default_rng([seed, 32])
-        self._errors, self._has_airspeed, self._has_range = errors, airspeed, rangefinder
+        self._errors, self._has_airspeed, self._has_range, self._mount = errors, airspeed, rangefinder, mount
         self._gnss = Gnss(frame, seed=seed, events=events)
         self._gyro_bias = rng.normal(0.0, 1.0, 3) * errors.gyro_bias_radps
         self._accel_bias = rng.normal(0.0, 1.0, 3) * errors.accel_bias_mps2
@@ -94,6 +96,7 @@ class VehicleSensors:
             airspeed_mps=self._airspeed(state, float(draws[AIR])),
             range_m=self._range(state, float(draws[RANGE])),
             gnss=self._gnss.read(state),
+            gimbal=self._mount.reported(state),
         )
 
     def _next_draws(self) -> np.ndarray:

@@ -115,6 +115,7 @@ def build_order(order: Order) -> Path | None:
     opened = MapPackage.open(package)
     for statement in opened.manifest.inputs:
         order.say.print(statement.text(), highlight=False)
+    order.say.print(f"{package}: written; 'terrafix map preview {package}' draws it", highlight=False)
     opened.close()
     return package
 
