@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafix.smoother import keyframe_graph
-from terrafix.smoother.keyframe_graph import LONE_FRAMES, Anchor, FrameNode, Join, KeyframeGraph
+from terrafix.smoother.keyframe_graph import LONE_FRAMES, Anchor, FrameNode, Join, KeyframeGraph, with_scale
 from terrafix.smoother.solution import followers, solve
 
 COV = np.diag([0.002, 0.002, 0.002, 0.1, 0.1, 0.1]) ** 2
@@ -166,7 +166,19 @@ def test_a_frame_between_keyframes_takes_its_share_of_the_correction_at_both() -
         moved = gtsam.Pose3(at.rotation(), at.translation() + np.array([0.0, 0.0, aside]))
         graph.add_anchor(keyframe, Anchor(moved, 1e-4 * np.eye(6)))
     placed = solve(graph)
-    between = dict(followers(graph, 1, placed))[5]
+    (followed,) = followers(graph, 1, placed)
+    assert followed[0] == 5
+    between = followed[1]
     assert placed[10].pose.z() - placed[1].pose.z() == pytest.approx(0.4, abs=0.05)
     assert between.pose.z() - placed[1].pose.z() == pytest.approx(0.2, abs=0.03)
     assert between.cov[2, 2] > max(placed[1].cov[2, 2], placed[10].cov[2, 2])
+
+
+def test_a_frame_far_from_its_keyframe_has_the_error_of_the_keyframes_attitude_as_a_position() -> None:
+    graph = chain(2)
+    graph.add_link(node(2, 1, gtsam.Pose3(gtsam.Rot3(), np.array([90.0, 0.0, 0.0]))))
+    graph.add_anchor(0, Anchor(world(0), 1e-4 * np.eye(6)))
+    placed = solve(graph)
+    ((_, far),) = followers(graph, 1, placed)
+    alone = with_scale(graph.frames[2])[5, 5] + placed[1].cov[2, 2]
+    assert far.cov[2, 2] > 20.0 * alone
