@@ -121,7 +121,7 @@ def _odometry(odometry: Odometry) -> LogEntry:
 
 def _map_match(match: MapMatch) -> LogEntry:
     fields = {"frame": match.frame_id, "verdict": match.verdict.value, "inliers": match.inliers}
-    return LogEntry("debug", "anchor", "map match", fields)
+    return LogEntry("debug", "anchor", "map match", {**fields, "refined": match.refined})
 
 
 def _model_event(event: ModelEvent) -> LogEntry:
