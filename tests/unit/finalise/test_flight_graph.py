@@ -1,5 +1,7 @@
 """Batch smoother after landing: accuracy, consistency, and rejection of outlier map matches."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -8,6 +10,9 @@ from map_matches import with_search
 from recorded_flight import blind_between, errors, replayed_graph, shifted, unmatched
 from simulated_flight import ORIGIN, EstimatorRun, Flight, error_m
 from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
+from terrafix.estimator.models.lens_prior import principal_point_sigma
 from terrafix.messages import MapMatch, Message, SearchResult, Verdict
 from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
@@ -54,6 +59,24 @@ def test_outlier_map_matches_are_rejected_even_three_consistent_ones() -> None:
     errors_m, _ = errors(flight, graph, smoothed)
     undisturbed, _ = errors(flight, clean, smooth(clean))
     assert median_m(errors_m) < 1.25 * median_m(undisturbed) + 0.3
+
+
+def test_an_unknown_principal_point_widens_the_solution_by_its_lever_and_a_map_is_compared_less_its_offset() -> None:
+    graph = replayed_graph(Flight(6, seed=4, fix_every=3))
+    camera = msgspec.structs.replace(graph.origin.camera, focal_sigma=0.1)
+    graph.principal_point = None
+    known, graph.principal_point = smooth(graph), PrincipalPointFilter(camera)
+    unknown = smooth(graph)
+    variance_m2 = [
+        np.array([tangent_to_world(c, p.rotation().matrix())[0, 0] for c, p in zip(one.covs, one.poses, strict=True)])
+        for one in (known, unknown)
+    ]
+    lever_m2 = (100.0 * principal_point_sigma(camera)) ** 2
+    assert variance_m2[1] - variance_m2[0] == pytest.approx(lever_m2, rel=0.15)
+    fix = graph.fixes[0]
+    moved = replace(known, map_offset_m={fix.map_sigma_m: (np.array([3.0, 4.0, 0.0]), np.zeros(3))})
+    off_m = moved.on_map(fix).translation() - known.camera[fix.node].translation()
+    assert off_m == pytest.approx([-3.0, -4.0, 0.0])
 
 
 def test_a_blackout_is_interpolated_from_both_sides() -> None:
