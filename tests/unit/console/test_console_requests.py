@@ -425,6 +425,16 @@ def test_a_flight_that_failed_is_tried_again_and_no_other(console: Console) -> N
         assert flights.image_of(db, flight_id, 3).attempts == 0
 
 
+def test_what_was_finalised_is_the_first_of_the_files_of_a_flight(console: Console) -> None:
+    flight_id = console.create()
+    out = console.service.settings.flight(flight_id) / "out"
+    out.mkdir(parents=True)
+    for name in ("estimates.csv", "finalised.csv", "flight.mcap"):
+        (out / name).write_bytes(b"x")
+    files = console.send("GET", f"/flights/{flight_id}/recordings").json["files"]
+    assert [file["name"] for file in files] == ["finalised.csv", "estimates.csv", "flight.mcap"]
+
+
 def test_a_flight_whose_process_dies_five_times_in_a_row_is_given_up_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
