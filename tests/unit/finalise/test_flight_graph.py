@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import gtsam
 import msgspec
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from terrafix.estimator.models.lens_prior import principal_point_sigma
 from terrafix.messages import MapMatch, Message, SearchResult, Verdict
 from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
-from terrafix_tools.finalise.flight_graph import FlightReplayer
+from terrafix_tools.finalise.fix_consistency import lost_sigma
+from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer
 from terrafix_tools.score import nees_of
 
 FAR_M = (350.0, -200.0)
@@ -77,6 +79,24 @@ def test_an_unknown_principal_point_widens_the_solution_by_its_lever_and_a_map_i
     moved = replace(known, map_offset_m={fix.map_sigma_m: (np.array([3.0, 4.0, 0.0]), np.zeros(3))})
     off_m = moved.on_map(fix).translation() - known.camera[fix.node].translation()
     assert off_m == pytest.approx([-3.0, -4.0, 0.0])
+
+
+def test_only_a_map_match_that_nothing_contradicted_ends_the_doubt_of_the_nodes_before_it() -> None:
+    def fix(node: int) -> Fix:
+        return Fix(node, gtsam.Pose3(), np.eye(6), 1.0, False, np.zeros((6, 2)), 0.0, True, None)
+
+    flight = FlightGraph(ORIGIN, fixes=[fix(2), fix(5)], lost_sigma_m={2: 0.0, 5: 800.0})
+    inliers, begins = np.ones(2, bool), np.zeros(8, int)
+    assert lost_sigma(flight, inliers, begins).tolist() == [0.0] * 3 + [800.0] * 5
+    assert lost_sigma(flight, np.array([False, True]), begins).tolist() == [800.0] * 8
+
+
+def test_map_matches_over_the_same_ground_count_with_their_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = replayed_graph(Flight(6, seed=4, fix_every=3))
+    alone = smooth(graph)
+    monkeypatch.setattr(batch_smoother, "information_shares", lambda flight: [0.2] * len(flight.fixes))
+    shared = smooth(graph)
+    assert np.trace(shared.covs[-1]) > 1.2 * np.trace(alone.covs[-1])
 
 
 def test_a_blackout_is_interpolated_from_both_sides() -> None:
