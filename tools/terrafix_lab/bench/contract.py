@@ -2,7 +2,7 @@
 
 python -m terrafix_lab.bench.contract OUT [--map MAP.gpkg] [--models FOLDER] [--json FILE]
 
-Exit code 1: a limit does not hold. Seconds by the clock, so on a computer that does nothing else. The search is that of
+Exit code 1: a limit does not hold. Seconds of the processor, which other programs change least. The search is that of
 the anchor, in its own process, which no frame of odometry or of the estimator waits for. Without ``--map`` a place of
 KM2 square kilometres is generated in OUT, unless it is there. Four models: XFeat and LighterGlue of ``--models``, and
 the two graphs of `terrafix models export`."""
@@ -103,9 +103,9 @@ def started(models: Path, work: Path) -> tuple[float, bool]:
 
 
 def _seconds(work: Callable[[], object]) -> float:
-    began_s = time.monotonic()
+    began_s = time.process_time()
     work()
-    return time.monotonic() - began_s
+    return time.process_time() - began_s
 
 
 def bench(
