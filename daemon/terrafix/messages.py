@@ -401,6 +401,7 @@ class MapMatch(Message, frozen=True, kw_only=True):
     # water and buildings
     matcher: str
     inliers: int = 0
+    refined: bool = False  # matched again from the pose of a first pass; False: passed through as first found
     reprojection_px: float = 0.0
     matches: list[tuple[float, float, float, float, float, float]] = []  # x, y (normalised); e, n, u (m); weight
     radial_k1: float = 0.0  # radial coefficient by which the matches are undistorted (as in Prediction)

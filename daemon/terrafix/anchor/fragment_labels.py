@@ -14,7 +14,8 @@ class FragmentLabels:
 
     def step_of(self, match: MapMatch, prediction: Prediction) -> SearchStep | None:
         """NEW_FRAGMENT for the first frame of a fragment that is not skipped, MERGE once when the fragment is joined to
-        the flight or a search has found the place; else None: ``match`` keeps its step."""
+        the flight or a search has found the place, SKIP for a frame that neither odometry nor the map registers; else
+        None: ``match`` keeps its step."""
         if match.search.step is SearchStep.SKIP:
             return None
         if self._begins(prediction.fragment_id):
@@ -25,7 +26,8 @@ class FragmentLabels:
         if match.search.relocalized or (self._open and (pose or joined)):
             self._open = False
             return SearchStep.MERGE
-        return None
+        tracking = match.search.step is SearchStep.NORMAL and match.verdict is not Verdict.ACCEPTED
+        return SearchStep.SKIP if tracking and prediction.fragment_id < 0 else None
 
     def _begins(self, fragment_id: int) -> bool:
         """Whether a fragment begins that is newer than all before."""

@@ -121,7 +121,7 @@ def _odometry(odometry: Odometry) -> LogEntry:
 
 def _map_match(match: MapMatch) -> LogEntry:
     fields = {"frame": match.frame_id, "verdict": match.verdict.value, "inliers": match.inliers}
-    return LogEntry("debug", "anchor", "map match", fields)
+    return LogEntry("debug", "anchor", "map match", {**fields, "refined": match.refined})
 
 
 def _model_event(event: ModelEvent) -> LogEntry:
@@ -134,6 +134,8 @@ def _model_event(event: ModelEvent) -> LogEntry:
 
 
 def _search_state(state: SearchState) -> LogEntry:
+    if state.step is SearchStep.SKIP:  # with a limit of its own (logs.RateLimit): every second frame may be one
+        return LogEntry("info", "search", "frame skipped", {"step": state.step.value})
     level = "debug" if state.step in TRACKING_STEPS else "warning" if state.step in SEARCHING_STEPS else "info"
     return LogEntry(level, "search", "search step", {"step": state.step.value})
 
@@ -176,6 +178,8 @@ def _verdict(verdict: MeasurementVerdict) -> LogEntry | None:
         return LogEntry("warning", "estimator", "graph begins again", {"frame": frame, "reason": verdict.detail})
     if verdict.verdict is Verdict.ACCEPTED and verdict.measurement == "user_fix":
         return LogEntry("info", "estimator", "UserFixApplied", {"frame": frame, "detail": verdict.detail})
+    if verdict.verdict is Verdict.ACCEPTED and verdict.measurement == "relocalization":
+        return LogEntry("info", "estimator", "relocalise", {"frame": frame})
     if verdict.verdict is Verdict.ACCEPTED:
         return None
     fields = {"verdict": verdict.verdict.value, "frame": frame, "detail": verdict.detail}

@@ -4,7 +4,7 @@ of the pose graph; all other frames follow theirs.
 A tree is a piece of the flight that odometry connects. It begins with a frame whose relation to the frames before is
 not measured (a new fragment, a graph that began anew), at the pose that the estimator predicted there."""
 
-from bisect import bisect_right
+from bisect import insort
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -113,7 +113,7 @@ class KeyframeGraph:
         self._lone.pop(parent, None)
         self._lone.pop(node.frame_id, None)
         self.frames[node.frame_id] = node
-        self._children.setdefault(parent, []).append(node.frame_id)
+        insort(self._children.setdefault(parent, []), node.frame_id)
         for anchor in self.anchors.pop(node.frame_id, []):
             self._put_anchor(node.frame_id, anchor)
         while len(self._children) > self._max_keyframes and (thinned := self._closest()) is not None:
@@ -212,8 +212,7 @@ class KeyframeGraph:
             child.between = node.between.compose(child.between)
             child.parent, child.walk2 = node.parent, node.walk2 + child.walk2
             child.scale_sigma = max(child.scale_sigma, node.scale_sigma)
-            siblings = self._children[node.parent]
-            siblings.insert(bisect_right(siblings, child_id), child_id)
+            insort(self._children[node.parent], child_id)
         for anchor in self.anchors.pop(keyframe, []):
             self._put_anchor(keyframe, anchor)
 

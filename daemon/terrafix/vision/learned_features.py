@@ -11,6 +11,9 @@ import numpy as np
 from terrafix.vision.features import Features, Matches
 from terrafix_engines.features.keypoints import Detector, Keypoints, MutualNearestMatcher, PairMatcher
 
+# Mutual nearest neighbours from which a learned matcher is not asked: at least 65 of them agreed with one homography,
+# three fifths of its own matches and more. [measured: docs/models.md]
+EASY_PAIRS = 200
 POINTS = 1024  # of an image in each rotation [spec: size of the LightGlue exports in docs/models.md]
 QUARTER_TURNS = 4
 
@@ -49,20 +52,23 @@ class LearnedMatcher:
         return _features(tuple(turned), tuple(places))
 
     def match(self, first: Features, second: Features) -> Matches:
-        """In the rotation with most mutual nearest neighbours: a learned matcher finds wrong matches in all of them."""
+        """In the rotation with most mutual nearest neighbours: a learned matcher finds wrong matches in all of them. Of
+        an easy pair these neighbours are the matches, and the learned matcher does not run."""
         assert isinstance(first, LearnedFeatures) and isinstance(second, LearnedFeatures)
-        turns, _ = self._rotation(first, second)
-        pairs, _ = self._matcher.match(first.turned[0], second.turned[turns])
+        turns, pairs = self._rotation(first, second)
+        if len(pairs) < EASY_PAIRS:
+            pairs, _ = self._matcher.match(first.turned[0], second.turned[turns])
         return Matches(first.places[0][pairs[:, 0]], second.places[turns][pairs[:, 1]])
 
     def shared(self, first: Features, second: Features) -> int:
-        return self._rotation(first, second)[1]
+        return len(self._rotation(first, second)[1])
 
-    def _rotation(self, first: Features, second: Features) -> tuple[int, int]:
-        """-> the quarter turns of the second image with most mutual nearest neighbours, and how many these are."""
+    def _rotation(self, first: Features, second: Features) -> tuple[int, np.ndarray]:
+        """-> the quarter turns of the second image with most mutual nearest neighbours, and these (N, 2)."""
         assert isinstance(first, LearnedFeatures) and isinstance(second, LearnedFeatures)
-        counts = [len(self._nearest.match(first.turned[0], turned)[0]) for turned in second.turned]
-        return int(np.argmax(counts)), max(counts)
+        pairs = [self._nearest.match(first.turned[0], turned)[0] for turned in second.turned]
+        turns = int(np.argmax([len(one) for one in pairs]))
+        return turns, pairs[turns]
 
 
 def _features(turned: tuple[Keypoints, ...], places: tuple[np.ndarray, ...]) -> LearnedFeatures:

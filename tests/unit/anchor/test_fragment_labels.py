@@ -5,7 +5,7 @@ import pytest
 from terrafix.anchor.fragment_labels import FragmentLabels
 from terrafix.messages import MapMatch, MapPose, Prediction, SearchResult, SearchStep, Verdict
 
-NEW, MERGE = SearchStep.NEW_FRAGMENT, SearchStep.MERGE
+NEW, MERGE, SKIP = SearchStep.NEW_FRAGMENT, SearchStep.MERGE, SearchStep.SKIP
 
 
 def prediction(fragment_id: int, *, joined: bool = True) -> Prediction:
@@ -50,7 +50,7 @@ def steps(labels: FragmentLabels, *frames: tuple[MapMatch, Prediction]) -> list[
         pytest.param([(0, True)] * 3, [None] * 3, id="a step with 30 m 1-sigma is no new fragment"),
         pytest.param(
             [(0, False), (1, False), (0, False), (-1, False), (1, False)],
-            [None, NEW, None, None, None],
+            [None, NEW, None, SKIP, None],
             id="a fragment that continues an older one is not new",
         ),
         pytest.param(
@@ -58,7 +58,11 @@ def steps(labels: FragmentLabels, *frames: tuple[MapMatch, Prediction]) -> list[
             [None, NEW, MERGE, None],
             id="a fragment that the estimator has joined is merged without a map",
         ),
-        pytest.param([(0, True), (1, False), (-1, True)], [None, NEW, None], id="a frame of no fragment merges none"),
+        pytest.param(
+            [(0, True), (1, False), (-1, True)],
+            [None, NEW, SKIP],
+            id="a frame of no fragment merges none and is skipped",
+        ),
     ],
 )
 def test_fragments_without_a_pose_on_the_map_have_these_steps(
@@ -82,6 +86,11 @@ def test_a_pose_on_the_map_merges_a_new_fragment_once_and_a_coarse_match_does_no
     open_fragment = prediction(1, joined=False)
     flown = [(match(), prediction(0)), (match(), open_fragment), (fixed, open_fragment), (fixed, open_fragment)]
     assert steps(FragmentLabels(), *flown) == [None, NEW, step, None]
+
+
+@pytest.mark.parametrize("by_map", [match(Verdict.ACCEPTED), match(Verdict.LOST, step=SearchStep.WIDEN)])
+def test_a_frame_of_no_fragment_that_the_map_places_or_a_search_uses_is_not_skipped(by_map: MapMatch) -> None:
+    assert steps(FragmentLabels(), (match(), prediction(0)), (by_map, prediction(-1))) == [None, None]
 
 
 def test_a_place_that_a_search_has_found_is_a_merge() -> None:

@@ -47,6 +47,7 @@ class ObservedFlight:
         i = self.next_id
         self.next_id += 1
         located = msgspec.structs.replace(estimate(i, 10.0 * i, 0.0), fragment_id=fragment, joined=joined)
+        located = msgspec.structs.replace(located, cov=(*located.cov[:35], 0.2**2))
         match = m.MapMatch(t_ns=located.t_ns, frame_id=i, verdict=verdict, matcher="gradient", inliers=12)
         self.observer.take([frame(i), located, with_search(match, step=step)])
         return self.observer.frame_done()
@@ -68,7 +69,7 @@ def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
     assert (result.match, result.inliers, result.source) == ("accepted", 12, "satellite_anchored")
     assert result.ellipse.semi_major_m == pytest.approx(4.0 * math.sqrt(5.991), abs=0.01)
     assert result.confidence == pytest.approx(1.0 - math.exp(-(20.0**2) / (2 * 4.0**2)), abs=1e-4)
-    assert result.heading_sigma == pytest.approx(math.degrees(0.1), abs=1e-3)
+    assert result.heading_sigma == pytest.approx(math.degrees(0.2), abs=1e-3)
     assert [name_of(type(e)) for e in outcome.events] == ["frame_processed", "fragment_changed"]
 
 
@@ -263,6 +264,10 @@ def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> 
         WaypointsUpdated(frames=1, first_frame=0, last_frame=0, url="/flights/f7/waypoints")
     ]
     assert flight.observer.rest().events == []
+    pose = m.RefinedPose(frame_id=0, lat_deg=48.5, lon_deg=11.5, alt_amsl_m=600.0, sigma_e_m=2.0, sigma_n_m=1.0)
+    flight.observer.take([m.Refinement(t_ns=1, poses=[pose])])
+    (after_the_end,) = flight.observer.rest().refined
+    assert after_the_end.m_per_unit == 1.25, "a refinement without a scale keeps the last one"
 
 
 def test_an_image_without_position_has_a_result_with_its_error() -> None:

@@ -20,7 +20,7 @@ from small_disk import small_disk
 from terrafix.core.errors import SourceError
 from terrafix.vision.sources.description import ATTITUDE_SIGMA_DEG
 from terrafix.vision.sources.photos import STATED_TILT_SIGMA_DEG
-from terrafix_tools.console import uploads
+from terrafix_tools.console import uploads, workers
 from terrafix_tools.console.compute.source import UploadedImages
 from terrafix_tools.console.new_flight import new_flight
 from terrafix_tools.console.openapi import schema
@@ -223,6 +223,9 @@ def test_a_completed_flight_takes_no_images_and_an_empty_one_is_not_completed(co
     console.upload(flight_id, batch(1))
     assert console.send("POST", f"/flights/{flight_id}/complete").json["completing"] is True
     assert_refused(console.upload(flight_id, batch(11)), 409, "being completed")
+    with console.service.database.write() as db:
+        flights.update(db, flight_id, state="completed")
+    assert_refused(console.send("POST", f"/flights/{flight_id}/hint", {"lat": 1.0, "lon": 2.0}), 409, "is completed")
 
 
 def test_a_fix_needs_a_frame_and_hints_are_numbered(console: Console) -> None:
@@ -420,6 +423,30 @@ def test_a_flight_that_failed_is_tried_again_and_no_other(console: Console) -> N
     assert (answer.status, answer.json["state"], answer.json["error"]) == (202, "processing", "")
     with console.service.database.read() as db:
         assert flights.image_of(db, flight_id, 3).attempts == 0
+
+
+def test_what_was_finalised_is_the_first_of_the_files_of_a_flight(console: Console) -> None:
+    flight_id = console.create()
+    out = console.service.settings.flight(flight_id) / "out"
+    out.mkdir(parents=True)
+    for name in ("estimates.csv", "finalised.csv", "flight.mcap"):
+        (out / name).write_bytes(b"x")
+    files = console.send("GET", f"/flights/{flight_id}/recordings").json["files"]
+    assert [file["name"] for file in files] == ["finalised.csv", "estimates.csv", "flight.mcap"]
+
+
+def test_a_flight_whose_process_dies_five_times_in_a_row_is_given_up_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    monkeypatch.setattr(workers, "RESTART_S", 0.0)
+    with Console(settings(tmp_path, workers=1)) as running:
+        flight_id = running.create()
+        running.upload(flight_id, batch(1))
+        until, path = time.monotonic() + 30.0, f"/flights/{flight_id}"
+        while not (flight := running.send("GET", path).json)["error"] and time.monotonic() < until:
+            time.sleep(0.01)
+    assert (flight["state"], flight["error"]) == ("blocked", "its process died 5 times in a row (exit code 1)")
 
 
 def test_a_flight_is_created_from_any_flight_toml_of_a_pinhole_camera(tmp_path: Path) -> None:

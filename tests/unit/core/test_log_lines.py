@@ -35,7 +35,7 @@ def rejected(frame_id: int, measurement: str, verdict: m.Verdict, detail: str = 
 
 
 SEVERITIES = {"warning": (-1, 0, 2, 4), "info": (5, 6, 9), "debug": (7,)}
-STEPS = {"debug": ("normal", "skip"), "info": ("new_fragment", "merge"), "warning": ("widen", "whole_map", "ask")}
+STEPS = {"debug": ("normal",), "info": ("new_fragment", "merge"), "warning": ("widen", "whole_map", "ask")}
 EVENTS = {"info": ("started", "stopped"), "warning": ("died", "stuck", "restarted"), "error": ("gave_up",)}
 CHANGES = {"info": ("opened", "resumed"), "warning": ("provider", "suspended", "failed"), "error": ("given_up",)}
 LINES: list[tuple[m.Message, str]] = [
@@ -55,6 +55,7 @@ LINES: list[tuple[m.Message, str]] = [
         for level, steps in STEPS.items()
         for step in steps
     ),
+    (m.SearchState(t_ns=7, step=m.SearchStep.SKIP), "info search: frame skipped, step skip"),
     *(
         (
             m.ProcessEvent(t_ns=7, process="anchor", event=event, detail="9"),
@@ -98,6 +99,7 @@ LINES: list[tuple[m.Message, str]] = [
         "debug map: measurement rejected, verdict innovation, frame 4, detail 12 m off",
     ),
     (rejected(-1, "height", m.Verdict.IMPLAUSIBLE), "debug height: measurement rejected, verdict implausible"),
+    (rejected(4, "relocalization", m.Verdict.ACCEPTED), "info estimator: relocalise, frame 4"),
     (
         rejected(4, "reset", m.Verdict.ACCEPTED, "indeterminate"),  # although its verdict is accepted
         "warning estimator: graph begins again, frame 4, reason indeterminate",
@@ -119,7 +121,7 @@ def test_a_log_line_has_the_fields_of_its_message() -> None:
     stream = io.StringIO()
     writer = logs.configure("INFO", "link", stream)
     logs.write(log_entry(m.StatusText(t_ns=1, severity=4, text="lost, send a position hint")))
-    logs.write(log_entry(m.SearchState(t_ns=1, step=m.SearchStep.SKIP)))  # below the configured level
+    logs.write(log_entry(m.SearchState(t_ns=1, step=m.SearchStep.NORMAL)))  # below the configured level
     logs.write(log_entry(hint(m.Verdict.INNOVATION)))
     writer.close()
     text, verdict = [json.loads(line) for line in stream.getvalue().splitlines()]

@@ -2,15 +2,17 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from flight_records import frame, write_record
-from recorded_flight import messages, record, shifted
+from recorded_flight import messages, record, replayed_graph, shifted
 from simulated_flight import Flight
 from terrafix.core.config import Config
 from terrafix.core.errors import SourceError
@@ -22,8 +24,9 @@ from terrafix.recorder.writer import FlightWriter
 from terrafix_tools.cli import app
 from terrafix_tools.estimates import RowTable, write_rows
 from terrafix_tools.evaluate import evaluate
+from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.point_cloud import VERTEX
-from terrafix_tools.finalise.run import finalise, last_lines
+from terrafix_tools.finalise.run import finalise, last_lines, m_per_unit
 from terrafix_tools.report.page import report
 
 FRAMES = 36
@@ -46,12 +49,25 @@ def test_finalised_csv_has_a_row_per_frame(flown: Path) -> None:
     rows = rows_of(flown)
     assert [r["file"] for r in rows] == [f"{i:04d}.jpg" for i in range(FRAMES)]
     assert all(float(r["sigma_e_m"]) > 0.0 and 0.0 <= float(r["yaw_deg"]) < 360.0 for r in rows)
+    covs = np.array([[float(v) for v in r["cov"].split()] for r in rows])
+    for column, i in (("cov_en_m2", 1), ("sigma_e_m", 0), ("sigma_n_m", 7), ("sigma_u_m", 14)):
+        stated = [float(r[column]) if column == "cov_en_m2" else float(r[column]) ** 2 for r in rows]
+        assert stated == pytest.approx(covs[:, i], rel=1e-3, abs=1e-3)
     summary = json.loads((flown / "finalised.json").read_text(encoding="utf-8"))
     assert summary["frames"] == summary["finalised"] == FRAMES and summary["cut_off"] == []
     assert summary["flights"][0]["map_matches"]["believed"] == 4
     focal, k1 = summary["flights"][0]["before_after"][:2]
     assert focal["before"] == focal["after"] == 560.0  # no point was seen by three keyframes
     assert k1["what"] == "radial coefficient" and 0.0 < k1["after_sigma"] < 0.05
+
+
+def test_the_scale_of_a_segment_is_its_length_in_the_solution_over_that_by_odometry() -> None:
+    flight = replayed_graph(Flight(12, seed=2))
+    solved = smooth(flight, estimates_lens=False)
+    ((begin, as_flown),) = m_per_unit(flight, solved).items()
+    assert as_flown == pytest.approx(1.0, abs=0.05)
+    moved = [gtsam.Pose3(pose.rotation(), 1.5 * pose.translation()) for pose in solved.poses]
+    assert m_per_unit(flight, replace(solved, poses=moved)) == {begin: pytest.approx(1.5 * as_flown, rel=1e-3)}
 
 
 def test_points_of_the_ground_are_written_beside_the_track(flown: Path) -> None:

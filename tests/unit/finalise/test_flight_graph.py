@@ -1,5 +1,8 @@
 """Batch smoother after landing: accuracy, consistency, and rejection of outlier map matches."""
 
+from dataclasses import replace
+
+import gtsam
 import msgspec
 import numpy as np
 import pytest
@@ -8,10 +11,14 @@ from map_matches import with_search
 from recorded_flight import blind_between, errors, replayed_graph, shifted, unmatched
 from simulated_flight import ORIGIN, EstimatorRun, Flight, error_m
 from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.pose import tangent_to_world
+from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
+from terrafix.estimator.models.lens_prior import principal_point_sigma
 from terrafix.messages import MapMatch, Message, SearchResult, Verdict
 from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
-from terrafix_tools.finalise.flight_graph import FlightReplayer
+from terrafix_tools.finalise.fix_consistency import lost_sigma
+from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer
 from terrafix_tools.score import nees_of
 
 FAR_M = (350.0, -200.0)
@@ -54,6 +61,42 @@ def test_outlier_map_matches_are_rejected_even_three_consistent_ones() -> None:
     errors_m, _ = errors(flight, graph, smoothed)
     undisturbed, _ = errors(flight, clean, smooth(clean))
     assert median_m(errors_m) < 1.25 * median_m(undisturbed) + 0.3
+
+
+def test_an_unknown_principal_point_widens_the_solution_by_its_lever_and_a_map_is_compared_less_its_offset() -> None:
+    graph = replayed_graph(Flight(6, seed=4, fix_every=3))
+    camera = msgspec.structs.replace(graph.origin.camera, focal_sigma=0.1)
+    graph.principal_point = None
+    known, graph.principal_point = smooth(graph), PrincipalPointFilter(camera)
+    unknown = smooth(graph)
+    variance_m2 = [
+        np.array([tangent_to_world(c, p.rotation().matrix())[0, 0] for c, p in zip(one.covs, one.poses, strict=True)])
+        for one in (known, unknown)
+    ]
+    lever_m2 = (100.0 * principal_point_sigma(camera)) ** 2
+    assert variance_m2[1] - variance_m2[0] == pytest.approx(lever_m2, rel=0.15)
+    fix = graph.fixes[0]
+    moved = replace(known, map_offset_m={fix.map_sigma_m: (np.array([3.0, 4.0, 0.0]), np.zeros(3))})
+    off_m = moved.on_map(fix).translation() - known.camera[fix.node].translation()
+    assert off_m == pytest.approx([-3.0, -4.0, 0.0])
+
+
+def test_only_a_map_match_that_nothing_contradicted_ends_the_doubt_of_the_nodes_before_it() -> None:
+    def fix(node: int) -> Fix:
+        return Fix(node, gtsam.Pose3(), np.eye(6), 1.0, False, np.zeros((6, 2)), 0.0, True, None)
+
+    flight = FlightGraph(ORIGIN, fixes=[fix(2), fix(5)], lost_sigma_m={2: 0.0, 5: 800.0})
+    inliers, begins = np.ones(2, bool), np.zeros(8, int)
+    assert lost_sigma(flight, inliers, begins).tolist() == [0.0] * 3 + [800.0] * 5
+    assert lost_sigma(flight, np.array([False, True]), begins).tolist() == [800.0] * 8
+
+
+def test_map_matches_over_the_same_ground_count_with_their_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = replayed_graph(Flight(6, seed=4, fix_every=3))
+    alone = smooth(graph)
+    monkeypatch.setattr(batch_smoother, "information_shares", lambda flight: [0.2] * len(flight.fixes))
+    shared = smooth(graph)
+    assert np.trace(shared.covs[-1]) > 1.2 * np.trace(alone.covs[-1])
 
 
 def test_a_blackout_is_interpolated_from_both_sides() -> None:

@@ -4,10 +4,12 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import msgspec
 import numpy as np
 import pytest
 
+from simulated_flight import ORIGIN
 from terrafix.core.pose import tangent_to_world
 from terrafix_lab.montecarlo.fault import DrawnFault
 from terrafix_lab.montecarlo.flight import Run
@@ -16,7 +18,7 @@ from terrafix_tools.before_after import Change
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import FlightGraph, FlightReplayer
 from terrafix_tools.finalise.held_out import EVERY, choose
-from terrafix_tools.finalise.run import solved_track
+from terrafix_tools.finalise.run import PlacedCamera, heights_as_seen, solved_track
 from terrafix_tools.finalised import read_flights
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.sections_run import finalised as section
@@ -54,6 +56,15 @@ def test_a_focal_length_that_is_3_percent_off_is_found() -> None:
     covs = [tangent_to_world(at.cov, at.pose.rotation().matrix()) for at in placed.values()]
     sigma_m = np.sqrt(np.mean([cov[2, 2] for cov in covs]))
     assert np.sqrt(np.mean(up_m**2)) < 3.0 * sigma_m  # in heights as seen it would be 3 % of 176 m
+
+
+def test_heights_as_seen_through_the_described_lens_have_its_share_of_the_height() -> None:
+    camera, above_m = msgspec.structs.replace(ORIGIN.camera, focal_sigma=0.02), 80.0
+    flight = FlightGraph(msgspec.structs.replace(ORIGIN, camera=camera, ground_amsl_m=500.0))
+    down = gtsam.Pose3(gtsam.Rot3(np.diag([1.0, -1.0, -1.0])), np.array([0.0, 0.0, 500.0 + above_m]))
+    placed = {3: PlacedCamera(down, np.eye(6), np.zeros(6))}
+    added = heights_as_seen(flight, placed)[3].cov - np.eye(6)
+    assert added[5, 5] == pytest.approx((0.02 * above_m) ** 2) and np.count_nonzero(added) == 1
 
 
 def test_a_row_of_before_and_after_has_both_with_their_sigma() -> None:

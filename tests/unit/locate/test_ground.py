@@ -123,6 +123,12 @@ def test_points_that_do_not_lie_in_a_plane_widen_the_height() -> None:
     assert patch.sigma_m == pytest.approx(expected)
 
 
+def test_points_behind_the_camera_are_not_below_it() -> None:
+    below = around(0.0, 503.0)
+    mirrored = replace(below, points_m=2.0 * view().p_c_in_w_m - below.points_m)
+    assert ground_patch(view(), DOWN, mirrored, None).surface is Surface.PLANE
+
+
 def test_points_with_large_errors_count_less() -> None:
     cloud = around(0.0, 500.0)
     points, sigma_m = cloud.points_m.copy(), cloud.sigma_m.copy()

@@ -14,6 +14,7 @@ from terrafix_tools.cli import app
 from terrafix_tools.console.compute.locating import Locators
 from terrafix_tools.console.locating import Question
 from terrafix_tools.locate.locator import FlightLocator
+from terrafix_tools.locate.views import read_views
 
 ROOF_M = np.array([rig.HOUSE_E_M + 4.0, -6.0, rig.START_AMSL_M + rig.HOUSE_M])
 FIELD_M = np.array([20.0, 30.0, rig.START_AMSL_M])
@@ -86,6 +87,7 @@ def test_height_is_not_above_sea_level_where_neither_start_nor_map_has_an_elevat
     arguments = ("--frame", "2", "--pixel", pixel(2, FIELD_M))
     assert json.loads(call(tmp_path, *arguments, "--json").output)["alt_amsl_m"] is None
     assert "above the ground at the start" in call(tmp_path, *arguments).output
+    assert FlightLocator(read_views(tmp_path), lambda e_m, _n_m: np.full(len(e_m), 500.0)).amsl_known
 
 
 def test_frame_of_no_fragment_is_located_without_points(tmp_path: Path) -> None:

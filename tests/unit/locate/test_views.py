@@ -84,14 +84,17 @@ def test_estimated_principal_point_moves_the_camera_to_where_described_rays_star
     learnt = msgspec.structs.replace(rig.calibration(0), lens=lens)
     body = msgspec.structs.replace(rig.estimate(0), cov=tuple((10.0 * np.eye(6)).ravel().tolist()))
     frame = m.Frame(t_ns=0, frame_id=0, file="0000.jpg", width=800, height=600)
-    write_record(
-        tmp_path / "flight.mcap",
-        [msgspec.structs.replace(rig.origin(), camera=camera), frame, rig.attitude(), body, learnt],
-    )
+    flown = [msgspec.structs.replace(rig.origin(), camera=camera), frame, rig.attitude(), body, learnt]
+    write_record(tmp_path / "flight.mcap", flown)
     view = read_views(tmp_path).views[0]
     # Heading east, the image's right is south: the camera of the graph is 2 m north of the published one.
     assert view.p_c_in_w_m[:2] == pytest.approx([0.0, 2.0], abs=1e-6)
     assert view.cov[0, 0] == pytest.approx(10.0 - (100.0 * 1e-3) ** 2)
+    again = tmp_path / "refined"
+    again.mkdir()
+    write_record(again / "flight.mcap", [*flown, refined(0.0, None, m.RefinementSource.FLIGHT)])
+    # ... and so for a refined pose, here turned by 0.02 rad
+    assert read_views(again).views[0].p_c_in_w_m[:2] == pytest.approx([0.0, 2.0], abs=0.05)
 
 
 def test_last_estimate_of_a_frame_counts(tmp_path: Path) -> None:

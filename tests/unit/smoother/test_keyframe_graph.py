@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafix.smoother import keyframe_graph
-from terrafix.smoother.keyframe_graph import LONE_FRAMES, Anchor, FrameNode, Join, KeyframeGraph
+from terrafix.smoother.keyframe_graph import LONE_FRAMES, Anchor, FrameNode, Join, KeyframeGraph, with_scale
 from terrafix.smoother.solution import followers, solve
 
 COV = np.diag([0.002, 0.002, 0.002, 0.1, 0.1, 0.1]) ** 2
@@ -135,8 +135,13 @@ def test_a_relocalisation_between_frames_is_one_between_their_keyframes() -> Non
     join = graph.on_keyframes(Join(20, 21, between, COV, 0.01))
     assert join is not None and (join.first, join.second) == (3, 7)
     assert np.allclose(join.between.matrix(), world(3).between(world(7)).matrix(), atol=1e-9)
-    assert np.trace(join.cov) > 2.0 * np.trace(COV)
     assert graph.on_keyframes(Join(3, 20, STEP, COV, 0.01)) is None, "of one keyframe"
+    uncertain = [graph.on_keyframes(Join(20, 21, between, 100.0 * COV, 0.01))]
+    for frame_id in (20, 21):
+        graph.frames[frame_id].cov = 100.0 * COV
+        uncertain.append(graph.on_keyframes(Join(20, 21, between, COV, 0.01)))
+        graph.frames[frame_id].cov = COV
+    assert all(np.trace(one.cov) > 10.0 * np.trace(join.cov) for one in uncertain if one is not None), "of all three"
 
 
 def test_a_tree_that_cannot_be_solved_does_not_keep_others_from_it() -> None:
@@ -161,7 +166,19 @@ def test_a_frame_between_keyframes_takes_its_share_of_the_correction_at_both() -
         moved = gtsam.Pose3(at.rotation(), at.translation() + np.array([0.0, 0.0, aside]))
         graph.add_anchor(keyframe, Anchor(moved, 1e-4 * np.eye(6)))
     placed = solve(graph)
-    between = dict(followers(graph, 1, placed))[5]
+    (followed,) = followers(graph, 1, placed)
+    assert followed[0] == 5
+    between = followed[1]
     assert placed[10].pose.z() - placed[1].pose.z() == pytest.approx(0.4, abs=0.05)
     assert between.pose.z() - placed[1].pose.z() == pytest.approx(0.2, abs=0.03)
     assert between.cov[2, 2] > max(placed[1].cov[2, 2], placed[10].cov[2, 2])
+
+
+def test_a_frame_far_from_its_keyframe_has_the_error_of_the_keyframes_attitude_as_a_position() -> None:
+    graph = chain(2)
+    graph.add_link(node(2, 1, gtsam.Pose3(gtsam.Rot3(), np.array([90.0, 0.0, 0.0]))))
+    graph.add_anchor(0, Anchor(world(0), 1e-4 * np.eye(6)))
+    placed = solve(graph)
+    ((_, far),) = followers(graph, 1, placed)
+    alone = with_scale(graph.frames[2])[5, 5] + placed[1].cov[2, 2]
+    assert far.cov[2, 2] > 20.0 * alone

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -120,8 +121,17 @@ def test_the_error_that_all_map_matches_share_is_not_averaged() -> None:
         track.fly(0, 40)
         track.feed([*(track.anchor(i, map_sigma_m=map_sigma_m) for i in range(39)), track.prediction(46)])
         sigmas[map_sigma_m] = track.refined[20].sigma_e_m
+        assert np.reshape(track.refined[20].cov, (6, 6))[0, 0] == pytest.approx(sigmas[map_sigma_m] ** 2)
     assert sigmas[0.0] < 0.5 * np.sqrt(ANCHOR_COV[3, 3])
     assert sigmas[4.0] == pytest.approx(np.hypot(sigmas[0.0], 4.0), rel=0.1)
+
+
+def test_a_frame_with_two_possible_positions_reaches_both() -> None:
+    track = Track()
+    track.fly(0, 39)
+    doubtful = msgspec.structs.replace(track.link(39, 38), ambiguity_m2=(900.0, 0.0, 0.0, 0.0))
+    track.feed([track.prediction(39), doubtful, *(track.anchor(i) for i in range(40)), track.prediction(46)])
+    assert track.refined[39].sigma_e_m == pytest.approx(30.0, rel=0.01) and track.refined[39].sigma_n_m < 1.0
 
 
 def test_the_covariance_grows_with_the_distance_from_the_map_matches() -> None:

@@ -12,7 +12,7 @@ from terrafix.core.errors import ModelError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
 from terrafix.messages import Frame, ModelChange, ModelEvent, Odometry, Verdict
-from terrafix.vision.learned_features import LearnedMatcher
+from terrafix.vision.learned_features import EASY_PAIRS, LearnedFeatures, LearnedMatcher
 from terrafix.vision.node import VisionNode, make_node
 from terrafix_engines.features import open_point_features
 from terrafix_engines.features.keypoints import Keypoints, MutualNearestMatcher
@@ -68,6 +68,30 @@ def test_an_image_is_matched_in_any_rotation(turns: int) -> None:
     assert len(matches) == 8
     for (x, y), (x_turned, y_turned) in zip(matches.a_px.astype(int), matches.b_px.astype(int), strict=True):
         assert image[y, x] == turned[y_turned, x_turned] > 100
+
+
+class Asked(MutualNearestMatcher):
+    """A learned matcher that finds nothing and counts how often it is asked."""
+
+    times = 0
+
+    def match(self, first: Keypoints, second: Keypoints) -> tuple[np.ndarray, np.ndarray]:
+        self.times += 1
+        return np.zeros((0, 2), np.int64), np.zeros(0, np.float32)
+
+
+@pytest.mark.parametrize(("points", "times"), [(8, 1), (EASY_PAIRS - 1, 1), (EASY_PAIRS, 0)])
+def test_the_learned_matcher_is_asked_for_the_pairs_of_images_that_nearest_neighbours_do_not_match(
+    points: int, times: int
+) -> None:
+    descriptors = np.random.default_rng(1).normal(size=(points, 64)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    xy_px = np.random.default_rng(2).uniform(0.0, 400.0, (points, 2)).astype(np.float32)
+    found = Keypoints(xy_px, np.ones(points, np.float32), descriptors, (400, 400))
+    features = LearnedFeatures(xy_px, descriptors, np.ones(points, np.float32), (found,) * 4, (xy_px,) * 4)
+    asked = Asked()
+    matches = LearnedMatcher(Upright(), asked).match(features, features)
+    assert (asked.times, len(matches)) == (times, 0 if times else points)
 
 
 def test_the_strongest_points_are_the_coarse_ones() -> None:

@@ -156,7 +156,8 @@ class CorrelationResult:
 class PatchFix:
     """2D-3D matches of one frame and the pose from them. ``xy`` (N, 2): normalised image coordinates; ``points_w_m``
     (N, 3): map points, local east, north and AMSL height; ``weights`` (N,); ``cell_m``: cell size of the patches;
-    ``given``: with which PnP has computed ``pnp``; None: another method has."""
+    ``given``: with which PnP has computed ``pnp``; None: another method has. ``refined``: matched again from the pose
+    of a first pass."""
 
     xy: np.ndarray
     points_w_m: np.ndarray
@@ -164,6 +165,7 @@ class PatchFix:
     pnp: PnpResult
     cell_m: float
     given: PnpInput | None = None
+    refined: bool = False
 
 
 class FrameMatcher:
@@ -304,7 +306,8 @@ class FrameMatcher:
             first = self._patch_fix(describer, image, view, FIRST_SEARCH_RADIUS, FIRST_THRESHOLD)
             if first is None or first.pnp.fit is None:
                 return first
-            view = levelled_view(view, first)
+            second = self._patch_fix(describer, image, levelled_view(view, first), SEARCH_RADIUS, INLIER_THRESHOLD)
+            return None if second is None else replace(second, refined=True)
         return self._patch_fix(describer, image, view, SEARCH_RADIUS, INLIER_THRESHOLD)
 
     def refine_fix(self, image: Image, view: View, fix: PatchFix) -> PatchFix:
@@ -313,7 +316,8 @@ class FrameMatcher:
         if fix.pnp.fit is None:
             return fix
         finer = self._patch_fix(self.gradients, image, view_of_fix(view, fix), SEARCH_RADIUS, INLIER_THRESHOLD)
-        return finer if finer is not None and finer.pnp.verdict is Verdict.ACCEPTED else fix
+        accepted = finer is not None and finer.pnp.verdict is Verdict.ACCEPTED
+        return replace(finer, refined=True) if finer is not None and accepted else fix
 
     def _patch_fix(
         self, describer: Describer, image: Image, view: View, radius_share: float, threshold: float

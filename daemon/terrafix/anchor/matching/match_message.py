@@ -55,6 +55,7 @@ def mode_match(match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tu
         match,
         verdict=Verdict.ACCEPTED,
         inliers=0,  # those of a pose that was rejected
+        refined=False,
         reprojection_px=0.0,
         matches=[],
         pnp=None,
@@ -74,7 +75,8 @@ def pose_match(match: MapMatch, fix: PatchFix | None, view: View) -> MapMatch:
     if fix is None:
         return msgspec.structs.replace(match, verdict=Verdict.DEGENERATE)
     verdict, fit = fix.pnp.verdict, fix.pnp.fit
-    match = msgspec.structs.replace(match, verdict=verdict, inliers=int(fix.pnp.inliers.sum()))
+    inliers = int(fix.pnp.inliers.sum())
+    match = msgspec.structs.replace(match, verdict=verdict, inliers=inliers, refined=fix.refined)
     if fit is None:
         return match
     assert match.place is not None

@@ -103,7 +103,7 @@ class PlaceVerifier:
         found = self.verify(
             image, view_of_fix(view, first), FIX_GSD_PER_AGL["gradient"], SEARCH_RADIUS, tilt_prior=False
         )
-        return None if found is None else found.fix
+        return None if found is None else replace(found.fix, refined=True)
 
     def _reduced(self, image: Image, agl_m: float) -> tuple[Image, CameraCalibration]:
         """The frame reduced to about two pixels per fine cell, computed once for all places."""

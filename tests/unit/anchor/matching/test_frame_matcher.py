@@ -168,7 +168,7 @@ def test_the_fix_at_a_known_position_gives_the_pose(matcher: FrameMatcher, frame
     assert fix is not None and fix.pnp.fit is not None and fix.pnp.verdict is Verdict.ACCEPTED
     assert np.linalg.norm(fix.pnp.fit.p_c_in_w_m - TRUE_M) < 1.5
     assert np.degrees(np.linalg.norm(log_so3(TRUE_R.T @ fix.pnp.fit.r_w_c))) < 0.6
-    assert fix.pnp.inliers.mean() > 0.9
+    assert fix.pnp.inliers.mean() > 0.9 and not fix.refined
     assert fix.xy.shape == (len(fix.weights), 2) and fix.points_w_m.shape == (len(fix.weights), 3)
 
 
@@ -227,7 +227,7 @@ def test_an_unknown_tilt_is_found(ground: np.ndarray, matcher: FrameMatcher) -> 
     # position from which a level camera would see the same ground
     apparent = TRUE_M[:2] + (tilted[:2, 2] / -tilted[2, 2]) * AGL_M
     fix = matcher.fix(image, predicted_view(tilt_sigma_deg=12.0), Hypothesis(0.0, 1.0), *apparent.tolist())
-    assert fix is not None and fix.pnp.fit is not None
+    assert fix is not None and fix.pnp.fit is not None and fix.refined
     assert np.degrees(np.linalg.norm(log_so3(tilted.T @ fix.pnp.fit.r_w_c))) < 1.5
     assert np.linalg.norm(fix.pnp.fit.p_c_in_w_m[:2] - TRUE_M[:2]) < 3.0
 

@@ -61,7 +61,8 @@ def test_all_matches_of_a_pnp_pose_are_published_and_the_pose_is_left_to_the_est
     match = pose_match(BEFORE, fix, VIEW)
     assert (match.verdict, match.pose, match.pnp) == (Verdict.ACCEPTED, None, GIVEN)
     assert np.array_equal(np.array(match.matches), np.column_stack([fix.xy, fix.points_w_m, fix.weights]))
-    assert match.inliers == COUNT - WRONG
+    assert match.inliers == COUNT - WRONG and not match.refined
+    assert pose_match(BEFORE, replace(fix, refined=True), VIEW).refined
     assert match.reprojection_px == pytest.approx(np.sqrt(np.mean(fit.residuals**2)) * 100.0 / 0.5)
 
 

@@ -36,6 +36,7 @@ GSD_M = 0.5
 BLOCK_PX = 512
 AGL_M = 150.0
 CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
+DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # camera to world, looking straight down
 EPSG, WEST_M, NORTH_M = 32632, 690_000.0, 5_330_000.0
 BELIEFS_M = {"in flight": 20.0, "lost": 300.0}  # 1-sigma of the belief for the correlation
 CORRELATIONS = 8
@@ -74,12 +75,12 @@ def search(package: Path) -> dict[str, Any]:
     before_mb = peak_memory_mb()
     began_s = time.monotonic()
     opened = MapPackage.open(package)
-    place = _centre(opened)
+    place = centre(opened)
     local = opened.bind(place)
     open_ms = (time.monotonic() - began_s) * 1e3
     matcher = FrameMatcher(CAMERA, local, open_describer(""))
-    frame = _frame(local)
-    view = View(0.0, 0.0, np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), AGL_M, 0.0, 0.03, 0.02, 0.02)
+    frame = frame_at(local, 0.0)
+    view = View(0.0, 0.0, DOWN, AGL_M, 0.0, 0.03, 0.02, 0.02)
     correlations_ms = {}
     for name, sigma_m in BELIEFS_M.items():
         belief = Belief(0.0, 0.0, sigma_m, belief_cell_m(AGL_M, matcher.correlation_cell_m(AGL_M)))
@@ -107,15 +108,17 @@ def _windows_ms(local: LocalMap, gsd_m: float) -> list[float]:
     return [_ms(read, time.monotonic) for read in reads]
 
 
-def _centre(package: MapPackage) -> LocalFrame:
+def centre(package: MapPackage) -> LocalFrame:
     west, south, east, north = package.manifest.bounds_wgs84
     return LocalFrame((south + north) / 2, (west + east) / 2)
 
 
-def _frame(local: LocalMap) -> np.ndarray:
-    """-> image of CAMERA that looks straight down at the centre, north up."""
+def frame_at(local: LocalMap, e_m: float) -> np.ndarray:
+    """-> image of CAMERA that looks straight down ``e_m`` east of the centre, north up."""
     gsd_m = AGL_M / CAMERA.fx
-    image, _ = local.window(-CAMERA.width / 2 * gsd_m, CAMERA.height / 2 * gsd_m, CAMERA.width, CAMERA.height, gsd_m)
+    image, _ = local.window(
+        e_m - CAMERA.width / 2 * gsd_m, CAMERA.height / 2 * gsd_m, CAMERA.width, CAMERA.height, gsd_m
+    )
     return image
 
 
