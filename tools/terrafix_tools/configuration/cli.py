@@ -34,9 +34,10 @@ def init(
     from terrafix_tools.configuration.first_files import FirstAnswers, Vehicle, write_first_files
     from terrafix_tools.installation import command
 
-    given = {"vehicle": vehicle, "camera": camera, "link": link}
+    given = {"vehicle": vehicle, "camera": camera}
     if not lens:
         given |= {"size": size, "fov": f"{fov:g}" if fov else ""}
+    given["link"] = link
     answers = {name: value or _ask(name) for name, value in given.items()}
     if answers["vehicle"] not in set(Vehicle):
         raise UsageError(f"--vehicle {answers['vehicle']}: choose one of {', '.join(Vehicle)}")
