@@ -179,10 +179,10 @@ async def read_parts(request: Request, folder: Path, limits: ServiceLimits) -> l
     return reader.parts
 
 
-def check_room(folder: Path, limits: ServiceLimits) -> None:
+def check_room(folder: Path, limits: ServiceLimits, needed_bytes: int = 0) -> None:
     """Raises Refusal (507): the disk is almost full."""
     free = shutil.disk_usage(folder).free
-    if free < limits.disk_reserve_bytes:
+    if free < limits.disk_reserve_bytes + needed_bytes:
         raise Refusal(FULL, f"{free // 2**20} MB are free on the disk of the console; delete flights or free space")
 
 

@@ -1,9 +1,8 @@
 // One flight: the first line, the map with the track, the frame, and the tabs.
 
-import {allResults, get, post} from "./api.js";
+import {allResults, download, get, post} from "./api.js";
 import {AskView} from "./ask_view.js";
-import {download, fill, h, say, toast} from "./dom.js";
-import {csv, geoJson} from "./export.js";
+import {fill, h, say, toast} from "./dom.js";
 import {bytes, clock, coordinate, metres, number, seconds} from "./format.js";
 import {FrameView} from "./frame_view.js";
 import {Glance} from "./glance.js";
@@ -140,7 +139,7 @@ export class FlightView {
       }
       if (focus) list.children[names.indexOf(name)].focus();
       this.dirty = true;
-      if (name === "export") this.listRecordings();
+      if (name === "export") this.listExports();
     };
     this.showTab = show;
     names.forEach((name) => {
@@ -170,28 +169,39 @@ export class FlightView {
   }
 
   exports() {
-    const give = (refined, kind) => async () => {
-      try {
-        const results = await allResults(this.flightId, refined);
-        const name = `${this.flightId}-${refined ? "refined" : "immediate"}`;
-        if (kind === "csv") download(`${name}.csv`, "text/csv", csv(results));
-        else download(`${name}.geojson`, "application/geo+json", geoJson(results));
-      } catch (error) {
-        toast(error.message, true);
-      }
-    };
-    const row = (label, refined) => h("p", {class: "actions"}, h("span", {}, label), h("button", {onclick: give(refined, "csv")}, "CSV"), h("button", {onclick: give(refined, "geojson")}, "GeoJSON"));
+    const picker = (id) => this[id] = h("select", {id: `export-${id}`});
+    const field = (id) => h("div", {class: "field"}, h("label", {for: `export-${id}`}, t(`export_${id}`)), picker(id));
+    this.exportButton = h("button", {class: "primary", onclick: () => this.export()}, t("export_now"));
     this.files = h("ul", {class: "lines"});
-    return h("div", {}, row(t("refined_results"), true), row(t("immediate_results"), false), h("h3", {}, t("recordings")), this.files);
+    return h("div", {}, field("format"), field("which"), h("p", {class: "actions"}, this.exportButton), h("p", {class: "soft"}, t("export_why")),
+      h("h3", {}, t("recordings")), this.files);
   }
 
-  async listRecordings() {
+  async listExports() {
     try {
-      const {files} = await get(`/flights/${this.flightId}/recordings`);
+      const path = `/flights/${this.flightId}`;
+      const [{formats, which}, {files}] = await Promise.all([get(`${path}/exports`), get(`${path}/recordings`)]);
+      const options = (select, names, text) => {
+        if (select.options.length !== names.length) fill(select, names.map((name) => h("option", {value: name}, t(`${text}_${name}`))));
+      };
+      options(this.format, formats, "export");
+      options(this.which, which, "export");
       fill(this.files, files.length ? files.map((file) => h("li", {}, h("a", {href: file.url, download: file.name}, file.name), ` ${bytes(file.bytes)}`)) : h("li", {class: "soft"}, t("none_yet")));
     } catch (error) {
       fill(this.files, h("li", {class: "soft"}, error.message));
     }
+  }
+
+  async export() {
+    this.exportButton.disabled = true;
+    try {
+      toast(t("export_made"));
+      const name = await download(`/flights/${this.flightId}/exports/${this.format.value}?which=${this.which.value}`);
+      toast(t("export_done", name));
+    } catch (error) {
+      toast(error.message, true);
+    }
+    this.exportButton.disabled = false;
   }
 
   // --- what comes ----------------------------------------------------------------------------------
