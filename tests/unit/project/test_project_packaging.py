@@ -48,6 +48,7 @@ IMPORTED_AS = {
     "systemd-python": "systemd",
     "pygobject": "gi",
     "jsonschema-rs": "jsonschema_rs",
+    "axe-core-python": "axe_core_python",
 }
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # used by scripts/check or the build
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX

@@ -67,6 +67,7 @@ export class FlightView {
     fill(this.main, main);
     this.mapView = new MapView(this.mapBox, this.info, (id) => this.select(id));
     this.mapView.onFollow = () => this.followButton.setAttribute("aria-pressed", "false");
+    this.mapView.map.on("resize", () => { this.dirty = true; }); // what it has to show is fitted anew
     this.mapView.onMeasure = (text) => { this.measured.textContent = text; };
   }
 
@@ -174,7 +175,7 @@ export class FlightView {
     this.exportButton = h("button", {class: "primary", onclick: () => this.export()}, t("export_now"));
     this.files = h("ul", {class: "lines"});
     return h("div", {}, field("format"), field("which"), h("p", {class: "actions"}, this.exportButton), h("p", {class: "soft"}, t("export_why")),
-      h("h3", {}, t("recordings")), this.files);
+      h("h2", {}, t("recordings")), this.files);
   }
 
   async listExports() {
@@ -257,7 +258,7 @@ export class FlightView {
     this.uploading = Boolean(uploads.get(this.flightId)?.running);
     const {model} = this;
     const {flight} = model;
-    fill(this.middle, h("strong", {class: "flight-name"}, flight.name || flight.flight_id), stateBadge(flight),
+    fill(this.middle, h("h1", {class: "flight-name"}, flight.name || flight.flight_id), stateBadge(flight),
       h("span", {class: `badge link ${model.connection}`}, t(`link_${model.connection}`)));
     this.glance.update(model);
     this.showLost();
@@ -270,7 +271,7 @@ export class FlightView {
     this.panels[this.tab].update(model);
     if (this.more) {
       const open = !model.isLive && flight.state !== "completed";
-      this.moreLabel.hidden = this.more.disabled = this.completeButton.hidden = !open;
+      this.moreLabel.hidden = this.more.hidden = !open;
       this.more.disabled = !open || this.uploading;
       this.completeButton.hidden = !open || flight.completing;
       this.askButton.hidden = flight.state === "completed" || !model.newest;
@@ -379,7 +380,8 @@ export class FlightView {
   help() {
     if (this.ask) return;
     const request = this.model.request ?? {frame_id: this.shown.frame_id, candidate_tiles: []};
-    this.ask = new AskView(this.model.flight, request, this.info, this.topOf(this.model.results.get(request.frame_id)));
+    const result = this.model.results.get(request.frame_id);
+    this.ask = new AskView(this.model.flight, request, this.info, result?.file, this.topOf(result));
     this.ask.onClosed = () => { this.ask = null; };
     this.ask.onSent = (path, body) => {
       this.mapView.addMark(body, body.radius_m ?? 5);
