@@ -1,23 +1,22 @@
 // One flight: the first line, the map with the track, the frame, and the tabs.
 
-import {allResults, download, get, post} from "./api.js";
+import {allResults, get, post} from "./api.js";
 import {AskView} from "./ask_view.js";
 import {fill, h, say, toast} from "./dom.js";
-import {bytes, clock, coordinate, metres, number, seconds} from "./format.js";
+import {clock, coordinate, metres, number, seconds} from "./format.js";
 import {FrameView} from "./frame_view.js";
 import {Glance} from "./glance.js";
 import {stateBadge} from "./list_view.js";
 import {MapView} from "./map_view.js";
 import {FlightModel} from "./model.js";
-import {uploads, startUpload} from "./new_view.js";
-import {LogPanel, ObjectPanel, OverviewPanel, VehiclePanel, VerdictPanel} from "./panels.js";
+import {ExportPanel, LogPanel, ObjectPanel, OverviewPanel, VehiclePanel, VerdictPanel} from "./panels.js";
 import {mayAct} from "./session.js";
 import {SOURCES, sign} from "./sources.js";
 import {EventStream} from "./stream.js";
 import {t} from "./texts.js";
 import {words} from "./words.js";
 import {compareNames, sorted} from "./photos.js";
-import {BATCH, readTable} from "./upload.js";
+import {BATCH, readTable, startUpload, uploads} from "./upload.js";
 
 const EARLIER_EVENTS = 1000; // that are read again when a flight is opened: the logs keep as many
 const REFRESH_MS = 1000; // between two readings of the flight itself, and of live images
@@ -127,7 +126,7 @@ export class FlightView {
   tabs() {
     this.objects = new ObjectPanel();
     this.panels = {overview: new OverviewPanel(this.actions()), ...(this.model.isLive ? {vehicle: new VehiclePanel()} : {}),
-      verdicts: new VerdictPanel(), log: new LogPanel(), objects: this.objects, export: {element: this.exports(), update() {}}};
+      verdicts: new VerdictPanel(), log: new LogPanel(), objects: this.objects, export: new ExportPanel(`/flights/${this.flightId}`)};
     const names = Object.keys(this.panels);
     const list = h("div", {class: "tabs", role: "tablist"});
     const show = (name, focus = false) => {
@@ -140,7 +139,7 @@ export class FlightView {
       }
       if (focus) list.children[names.indexOf(name)].focus();
       this.dirty = true;
-      if (name === "export") this.listExports();
+      if (name === "export") this.panels.export.list();
     };
     this.showTab = show;
     names.forEach((name) => {
@@ -167,42 +166,6 @@ export class FlightView {
     this.askButton = h("button", {onclick: () => this.help()}, t("give_position"));
     const copy = this.model.isLive ? null : h("a", {class: "button", href: `#/new/${this.flightId}`}, t("duplicate"));
     return h("div", {class: "actions"}, this.more, this.moreLabel, this.completeButton, this.askButton, copy);
-  }
-
-  exports() {
-    const picker = (id) => this[id] = h("select", {id: `export-${id}`});
-    const field = (id) => h("div", {class: "field"}, h("label", {for: `export-${id}`}, t(`export_${id}`)), picker(id));
-    this.exportButton = h("button", {class: "primary", onclick: () => this.export()}, t("export_now"));
-    this.files = h("ul", {class: "lines"});
-    return h("div", {}, field("format"), field("which"), h("p", {class: "actions"}, this.exportButton), h("p", {class: "soft"}, t("export_why")),
-      h("h2", {}, t("recordings")), this.files);
-  }
-
-  async listExports() {
-    try {
-      const path = `/flights/${this.flightId}`;
-      const [{formats, which}, {files}] = await Promise.all([get(`${path}/exports`), get(`${path}/recordings`)]);
-      const options = (select, names, text) => {
-        if (select.options.length !== names.length) fill(select, names.map((name) => h("option", {value: name}, t(`${text}_${name}`))));
-      };
-      options(this.format, formats, "export");
-      options(this.which, which, "export");
-      fill(this.files, files.length ? files.map((file) => h("li", {}, h("a", {href: file.url, download: file.name}, file.name), ` ${bytes(file.bytes)}`)) : h("li", {class: "soft"}, t("none_yet")));
-    } catch (error) {
-      fill(this.files, h("li", {class: "soft"}, error.message));
-    }
-  }
-
-  async export() {
-    this.exportButton.disabled = true;
-    try {
-      toast(t("export_made"));
-      const name = await download(`/flights/${this.flightId}/exports/${this.format.value}?which=${this.which.value}`);
-      toast(t("export_done", name));
-    } catch (error) {
-      toast(error.message, true);
-    }
-    this.exportButton.disabled = false;
   }
 
   // --- what comes ----------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 // The tabs beside the map.
 
-import {fill, h} from "./dom.js";
+import {download, get} from "./api.js";
+import {fill, h, toast} from "./dom.js";
 import {NONE, bytes, clock, coordinate, metres, number, unit} from "./format.js";
 import {freshFacts} from "./glance.js";
 import {t} from "./texts.js";
@@ -160,3 +161,43 @@ export class ObjectPanel {
   }
 }
 
+/** ``path``: of the flight. */
+export class ExportPanel {
+  constructor(path) {
+    this.path = path;
+    const field = (id) => {
+      this[id] = h("select", {id: `export-${id}`});
+      return h("div", {class: "field"}, h("label", {for: `export-${id}`}, t(`export_${id}`)), this[id]);
+    };
+    this.button = h("button", {class: "primary", onclick: () => this.export()}, t("export_now"));
+    this.files = h("ul", {class: "lines"});
+    this.element = h("div", {}, field("format"), field("which"), h("p", {class: "actions"}, this.button), h("p", {class: "soft"}, t("export_why")),
+      h("h2", {}, t("recordings")), this.files);
+  }
+
+  update() {}
+
+  /** What there is now. */
+  async list() {
+    try {
+      const [{formats, which}, {files}] = await Promise.all([get(`${this.path}/exports`), get(`${this.path}/recordings`)]);
+      for (const [select, names] of [[this.format, formats], [this.which, which]]) {
+        if (select.options.length !== names.length) fill(select, names.map((name) => h("option", {value: name}, t(`export_${name}`))));
+      }
+      fill(this.files, files.length ? files.map((file) => h("li", {}, h("a", {href: file.url, download: file.name}, file.name), ` ${bytes(file.bytes)}`)) : h("li", {class: "soft"}, t("none_yet")));
+    } catch (error) {
+      fill(this.files, h("li", {class: "soft"}, error.message));
+    }
+  }
+
+  async export() {
+    this.button.disabled = true;
+    try {
+      toast(t("export_made"));
+      toast(t("export_done", await download(`${this.path}/exports/${this.format.value}?which=${this.which.value}`)));
+    } catch (error) {
+      toast(error.message, true);
+    }
+    this.button.disabled = false;
+  }
+}
