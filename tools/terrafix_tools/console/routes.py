@@ -30,7 +30,6 @@ from terrafix_tools.console.payloads import (
     Tokens,
     UserFix,
 )
-from terrafix_tools.console.photo_facts import photo_facts
 from terrafix_tools.console.problems import Refusal
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.store import flights
@@ -194,7 +193,7 @@ async def upload(request: Request, flight_id: FlightId) -> Accepted:
 @router.post("/photos", openapi_extra=PHOTOS_BODY)
 async def photos(request: Request) -> PhotoFacts:
     """What photos state of their flight, and where each number comes from: for the form of a new flight."""
-    return await photo_facts(request, service_of(request).settings.limits)
+    return await service_of(request).photo_facts(request)
 
 
 @router.post("/flights/{flight_id}/copy", status_code=201)

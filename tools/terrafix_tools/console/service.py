@@ -37,6 +37,7 @@ from terrafix_tools.console.payloads import (
     NewFlight,
     ObjectGps,
     ObjectPixel,
+    PhotoFacts,
     RecordingFile,
     Recordings,
     RouteArea,
@@ -44,6 +45,7 @@ from terrafix_tools.console.payloads import (
     Steered,
     UserFix,
 )
+from terrafix_tools.console.photo_facts import photo_facts
 from terrafix_tools.console.problems import FULL, Refusal
 from terrafix_tools.console.settings import Settings
 from terrafix_tools.console.store import flights
@@ -209,6 +211,9 @@ class Service:
             raise Refusal(429, f"{self.settings.limits.event_clients} event streams are the limit; close others")
         flight = await asyncio.to_thread(self.flight, flight_id)
         return self.feeds.of(flight_id).stream(min(after, flight.last_event_id))
+
+    async def photo_facts(self, request: Request) -> PhotoFacts:
+        return await photo_facts(request, self.settings.limits, self._uploads)
 
     # --- acting -----------------------------------------------------------------------------------
 
