@@ -260,14 +260,13 @@ def _format(key: str, value: float | int | None) -> str:
 def _table(result: dict[str, Any], folder: Path) -> Table:
     table = Table(title=f"{folder}: {result['localised']} of {result['frames']} frames localised", title_justify="left")
     table.add_column("")
-    table.add_column("immediate", justify="right")
-    table.add_column("refined", justify="right")
-    if "finalised" in result:
-        table.add_column("finalised", justify="right")
+    stages = [stage for stage in ("refined", "finalised") if stage == "refined" or stage in result]
+    for stage in ("immediate", *stages):
+        table.add_column(stage, justify="right")
     for key, value in result.items():
         if key.startswith(("refined_", "finalised")) or key in ("frames", "localised"):
             continue
-        others = [f"{stage}_{key}" for stage in ("refined", "finalised")]
+        others = [f"{stage}_{key}" for stage in stages]
         table.add_row(
             WORDS.get(key, key), _format(key, value), *(_format(o, result[o]) if o in result else "" for o in others)
         )

@@ -267,7 +267,7 @@ def _check_map(package: Path, origin: Origin) -> tuple[Origin, dict[str, Any]]:
             origin = msgspec.structs.replace(origin, ground_amsl_m=ground_m)
         manifest = opened.manifest
         return origin, {
-            "path": str(package),
+            "path": str(package.absolute()),
             "source": manifest.source,
             "checksum": manifest.checksum,
             "gsd_m": manifest.gsd_m,

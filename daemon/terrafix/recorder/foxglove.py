@@ -4,17 +4,20 @@ Schemas: https://docs.foxglove.dev/docs/visualization/message-schemas, JSON form
 message from which it follows. Reading a record ignores them."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any
 
 import msgspec
+import numpy as np
 
+from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.log_lines import MessageLog
-from terrafix.messages import Message, NavEstimate, Origin
+from terrafix.messages import MapMatch, Message, NavEstimate, Origin, Verdict
 
 NS = 1_000_000_000
-LOCATION_TOPIC, POSE_TOPIC, LOG_TOPIC = "/location", "/pose", "/log"
+LOCATION_TOPIC, POSE_TOPIC, LOG_TOPIC, MATCHES_TOPIC = "/location", "/pose", "/log", "/matches"
 THUMBNAIL_TOPIC, IMAGE_TOPIC = "/thumbnail", "/image"
 LOCAL_FRAME = "local"  # frame of poses: east, north, up about the origin of the flight; up is AMSL
 BODY_FRAME = "body"
@@ -99,11 +102,40 @@ class Log(Stamped, frozen=True, kw_only=True):
     line: int = 0
 
 
+class Point2(msgspec.Struct, frozen=True):
+    x: float
+    y: float
+
+
+class Color(msgspec.Struct, frozen=True):
+    r: float
+    g: float
+    b: float
+    a: float = 1.0
+
+
+class PointsAnnotation(Stamped, frozen=True, kw_only=True):
+    """``type`` 1: points; ``points``: pixels of the image, ``thickness`` in them."""
+
+    points: list[Point2]
+    outline_color: Color
+    type: int = 1
+    thickness: float = 3.0
+
+
+class ImageAnnotations(msgspec.Struct, frozen=True, kw_only=True):
+    points: list[PointsAnnotation]
+
+
+USED, NOT_USED = Color(0.2, 0.9, 0.4), Color(1.0, 0.7, 0.1)  # green, amber
+
+
 # Channels: topic and type of message. The schema is named foxglove.<type>.
-FOXGLOVE_CHANNELS: dict[str, type[Stamped]] = {
+FOXGLOVE_CHANNELS: dict[str, type[Stamped | ImageAnnotations]] = {
     LOCATION_TOPIC: LocationFix,
     POSE_TOPIC: PoseInFrame,
     LOG_TOPIC: Log,
+    MATCHES_TOPIC: ImageAnnotations,
     THUMBNAIL_TOPIC: CompressedImage,
     IMAGE_TOPIC: CompressedImage,
 }
@@ -112,16 +144,22 @@ _LEVELS = {"debug": LogLevel.DEBUG, "info": LogLevel.INFO, "warning": LogLevel.W
 
 
 class FoxgloveMessages:
-    """Derives messages; keeps the origin of the flight and the states of the log."""
+    """Derives messages; keeps the origin of the flight, the camera and the states of the log. ``width_px``: of the
+    thumbnails, in which matches are drawn."""
 
-    def __init__(self) -> None:
-        self._log = MessageLog()
+    def __init__(self, width_px: int) -> None:
+        self._log, self._width_px = MessageLog(), width_px
         self._frame: LocalFrame | None = None
+        self._camera: CameraCalibration | None = None
 
-    def of(self, message: Message) -> Iterator[tuple[str, Stamped]]:
+    def of(self, message: Message) -> Iterator[tuple[str, Stamped | ImageAnnotations]]:
         """Yields (topic, derived message)."""
         if isinstance(message, Origin):
             self._frame = LocalFrame(message.lat_deg, message.lon_deg)
+            small = min(1.0, self._width_px / message.camera.width)
+            self._camera = CameraCalibration.of(message.camera).scaled(small)
+        elif isinstance(message, MapMatch) and message.matches and self._camera is not None:
+            yield MATCHES_TOPIC, _matches(message, self._camera)
         elif isinstance(message, NavEstimate) and message.is_placed:
             yield LOCATION_TOPIC, _location(message)
             if self._frame is not None:
@@ -153,6 +191,18 @@ def _pose(estimate: NavEstimate, frame: LocalFrame) -> PoseInFrame:
     )
 
 
+def _matches(match: MapMatch, camera: CameraCalibration) -> ImageAnnotations:
+    """The points of the frame that the map has, as the lens shows them."""
+    xy = np.array(match.matches)[:, :2]
+    pixels = replace(camera, radial_k1=match.radial_k1).project(np.column_stack([xy, np.ones(len(xy))]))
+    drawn = PointsAnnotation(
+        timestamp=Time.of(match.t_ns),
+        points=[Point2(round(float(u), 1), round(float(v), 1)) for u, v in pixels],
+        outline_color=USED if match.verdict is Verdict.ACCEPTED else NOT_USED,
+    )
+    return ImageAnnotations(points=[drawn])
+
+
 def schema_name(topic: str) -> str:
     return f"foxglove.{FOXGLOVE_CHANNELS[topic].__name__}"
 
@@ -170,4 +220,6 @@ def _resolved(node: dict[str, Any], defs: dict[str, Any]) -> dict[str, Any]:
         return _resolved(defs[name], defs) | {"title": title}
     if node["type"] == "object":
         return {"type": "object", "properties": {k: _resolved(v, defs) for k, v in node["properties"].items()}}
-    return {key: node[key] for key in ("type", "contentEncoding", "items") if key in node}
+    if "items" in node:
+        return {"type": "array", "items": _resolved(node["items"], defs)}
+    return {key: node[key] for key in ("type", "contentEncoding") if key in node}

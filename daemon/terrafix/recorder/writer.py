@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 from mcap.writer import CompressionType, Writer
 
+from terrafix.core.config import RecorderSection
 from terrafix.core.errors import OutputError
 from terrafix.messages import Message, Origin, SourceFacts
 from terrafix.recorder import foxglove
@@ -43,7 +44,9 @@ class FlightWriter:
             self._register(topic_of(message_type), f"terrafix.{message_type.__name__}", schema_of(message_type))
         for topic in foxglove.FOXGLOVE_CHANNELS:
             self._register(topic, foxglove.schema_name(topic), foxglove.schema_of(topic))
-        self._foxglove = FoxgloveMessages()
+        config = msgspec.json.decode(header_metadata.get("config", "{}"))
+        width_px = config.get("recorder", {}).get("thumbnail_width_px", RecorderSection().thumbnail_width_px)
+        self._foxglove = FoxgloveMessages(width_px)
         self.flush()
 
     def write(self, message: Message, received_ns: int) -> None:

@@ -184,3 +184,4 @@ def test_the_table_has_words_for_every_metric_and_no_key(tmp_path: Path, capsys:
     shown_keys = {key for key in result if not key.startswith("refined_") and key not in ("frames", "localised")}
     assert shown_keys <= set(WORDS)
     assert "frames within 5 m" in shown and "median error" in shown and "within_5m" not in shown
+    assert "│  │" not in shown  # no column without a head

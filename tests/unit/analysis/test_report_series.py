@@ -1,5 +1,6 @@
 """Thinning of long series, statistics of innovations and of the delays by stage."""
 
+import re
 from collections import Counter
 
 import msgspec
@@ -35,6 +36,18 @@ def test_a_chart_of_an_hour_is_small() -> None:
     chart = Chart(x_max=3600.0, y_min=0.0, y_max=1.0)
     chart.line([(k / 10, (k % 7) / 7) for k in range(36_000)], "error")
     assert len(chart.marks[0]) < 60_000
+
+
+@pytest.mark.parametrize(("unit", "lengths"), [("s", [10, 2, 5]), ("", [10, 6])])
+def test_a_line_is_not_drawn_over_a_gap_in_time_nor_over_unknown_values(unit: str, lengths: list[int]) -> None:
+    chart = Chart(x_max=100.0, y_min=0.0, y_max=1.0, x_unit=unit)
+    points = [(float(k), None if k == 10 else 0.5) for k in range(12)]  # one alone after the unknown one
+    chart.line([*points, *((float(k), 0.5) for k in range(80, 85))], "error")
+    runs = [re.findall(r"[\d.]+,[\d.]+", mark) for mark in chart.marks]
+    assert [len(run) for run in runs] == lengths  # the one alone is a dot: a line of no length
+    chart.area([(0.0, 0.5), (1.0, 0.5), (2.0, 0.5), (60.0, 0.5)], "claim")
+    areas = [mark for mark in chart.marks if "<polygon" in mark]
+    assert len(areas) == (2 if unit == "s" else 1)
 
 
 def test_a_short_state_is_seen_among_many() -> None:

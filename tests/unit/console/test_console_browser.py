@@ -1,7 +1,6 @@
 """The page in a real browser, over HTTP: a flight from its photos to its track, the position of a pixel, the help that
 a lost flight asks for, and a connection that is lost and found again."""
 
-import csv
 import json
 import time
 from pathlib import Path
@@ -92,7 +91,7 @@ def test_a_route_instead_of_a_map_has_its_corridor_fetched(tmp_path: Path, windo
         assert area["corridor_m"] == 250.0
 
 
-def test_sizes_of_batches_distances_and_exports_of_the_page(tmp_path: Path, window: Browser) -> None:
+def test_sizes_of_batches_and_distances_of_the_page(tmp_path: Path, window: Browser) -> None:
     with Console(settings(tmp_path)) as console:
         window.open(f"{console.url}/page/#/")
         window.wait("document.querySelector('.page')")
@@ -109,20 +108,6 @@ def test_sizes_of_batches_distances_and_exports_of_the_page(tmp_path: Path, wind
         azimuth_deg, _, expected_m = Geod(ellps="WGS84").inv(14.35, 48.15, 14.37, 48.16)
         assert found[0] == pytest.approx(expected_m, abs=0.05)
         assert found[1] == pytest.approx(azimuth_deg, abs=0.02)
-
-        ellipse = {"semi_major_m": 100.0, "semi_minor_m": 50.0, "bearing_deg": 90.0}
-        result = {"frame_id": 3, "file": 'a,"b".jpg', "gps": here, "ellipse": ellipse, "error": None}
-        words = json.dumps([result, {"frame_id": 4, "file": "c.jpg", "gps": None, "ellipse": None}])
-        table, shapes = window.run(f"import('/page/js/export.js').then((m) => [m.csv({words}), m.geoJson({words})])")
-        rows = list(csv.DictReader(table.splitlines()))
-        assert [row["file"] for row in rows] == ['a,"b".jpg', "c.jpg"]
-        assert (rows[0]["lat"], rows[0]["semi_minor_m"], rows[1]["lat"]) == ("48.15", "50", "")
-        point, ring = json.loads(shapes)["features"]  # no track of a single point
-        assert point["geometry"]["coordinates"] == [14.35, 48.15]
-        corners = ring["geometry"]["coordinates"][0]
-        assert corners[0] == corners[-1]
-        half_m = Geod(ellps="WGS84").inv(14.35, 48.15, max(lon for lon, _ in corners), 48.15)[2]
-        assert half_m == pytest.approx(100.0, abs=0.1)
 
 
 def test_the_page_asks_for_the_token_and_offers_a_viewer_nothing_to_do(tmp_path: Path, window: Browser) -> None:

@@ -478,3 +478,13 @@ def test_the_tilt_of_photos_is_known_less_well_than_that_of_a_table(console: Con
         )
         sigmas[name] = source.origin().attitude_sigma_deg
     assert sigmas == {"photos": STATED_TILT_SIGMA_DEG, "table": ATTITUDE_SIGMA_DEG}
+
+
+def test_the_first_bytes_of_as_many_photos_as_a_batch_has_are_taken_and_no_more(console: Console) -> None:
+    def heads(size: int) -> list[tuple[str, str, bytes]]:
+        content = photo(0, 23.5, 121.0).ljust(size, b"\0")
+        return [("images", f"DJI_{i:04d}.JPG", content) for i in range(50)]
+
+    assert facts(console, heads(256 * 1024)).json["width"] == 640
+    refused = facts(console, heads(256 * 1024 + 1))
+    assert refused.status == 413 and "DJI_0000.JPG" in refused.json["detail"]

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from fleet_records import LAKE_M, LAKE_RADIUS_M, write_records
 from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix_tools.cli import app
 from terrafix_tools.fleet.build import build
-from terrafix_tools.fleet.page import write_page
+from terrafix_tools.fleet.page import months, write_page
 from terrafix_tools.fleet.places import METRES_PER_DEG, grids, picture, worst
 from terrafix_tools.fleet.query import FleetTables, query
 
@@ -199,6 +200,19 @@ def test_the_page_has_trends_places_and_errors_and_needs_no_other_file(fleet: Pa
     assert winter and f"{100 * shares[0][0]:.1f} %" in winter[0]
     assert text.count('<svg class="places"') == 3
     assert [path.name for path in out.parent.iterdir()] == ["page.html"]
+
+
+def test_a_month_without_flights_is_a_gap_in_the_line_of_the_page(tmp_path: Path) -> None:
+    class Months:
+        def ask(self, _sql: str) -> "Months":
+            return self
+
+        def objects(self) -> list[dict[str, object]]:
+            flown = (date(2025, 11, 1), date(2025, 12, 1), date(2026, 3, 1))
+            return [{"month": month, "refused": 0.1, "availability": 0.9, "flights": 2} for month in flown]
+
+    lines = re.findall(r'<polyline class="line none" points="([^"]*)"', months(Months()))  # type: ignore[arg-type]
+    assert [len(points.split()) for points in lines] == [2, 2]  # November and December; March as a dot
 
 
 def test_the_page_of_a_fleet_without_flights_says_so(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ TOPICS = [
         if key in config
     ),
     LAYOUT["configById"]["Image!frames"]["imageMode"]["imageTopic"],
+    *LAYOUT["configById"]["Image!frames"]["imageMode"]["annotations"],
     LAYOUT["configById"]["RawMessages!fault"]["topicPath"],
 ]
 
@@ -39,7 +40,7 @@ def test_a_path_names_a_message_and_its_field(path: str) -> None:
 
 
 def test_topics_are_those_of_a_record() -> None:
-    assert set(TOPICS) <= {*TYPE_BY_TOPIC, *FOXGLOVE_CHANNELS} and len(TOPICS) == 4
+    assert set(TOPICS) <= {*TYPE_BY_TOPIC, *FOXGLOVE_CHANNELS} and len(TOPICS) == 5
 
 
 def test_each_panel_is_placed_once() -> None:

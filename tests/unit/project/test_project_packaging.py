@@ -1,6 +1,7 @@
 """Declared dependencies, lock file and version agree with the code."""
 
 import ast
+import json
 import os
 import re
 import subprocess
@@ -11,11 +12,13 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import typer
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import terrafix
 from terrafix.core.errors import MapError
+from terrafix_tools.cli import app
 from terrafix_tools.installation import install_command
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -48,6 +51,7 @@ IMPORTED_AS = {
     "systemd-python": "systemd",
     "pygobject": "gi",
     "jsonschema-rs": "jsonschema_rs",
+    "axe-core-python": "axe_core_python",
 }
 COMMANDS = {"ruff", "mypy", "types-pyserial", "pytest-xdist", "hatchling"}  # used by scripts/check or the build
 EXPORTER = {"onnx", "onnxscript"}  # imported by PyTorch when it writes ONNX
@@ -344,3 +348,15 @@ def test_the_installer_of_the_wheel_installs_unit_and_settings(unpacked: Path, t
     assert too_new.returncode == 1 and "needs Python 3.11 to 3.14; found Python 3.15.2. See" in too_new.stderr
     no_package = subprocess.run(["sh", str(installer), "--prefix", str(tmp_path)], capture_output=True, text=True)
     assert no_package.returncode == 2 and "give the wheel with --package" in no_package.stderr
+
+
+def test_the_image_has_the_labels_of_a_blueos_extension() -> None:
+    text = (ROOT / "Containerfile").read_text(encoding="utf-8").replace("\\\n", "")
+    assert f"ARG VERSION={PROJECT['version']} " in text
+    labels = {name: json.loads(value) for name, value in re.findall(r"^LABEL (\w+)='(.*)'$", text, re.MULTILINE)}
+    assert set(labels) == {"authors", "company", "tags", "permissions"}
+    permissions = labels["permissions"]
+    assert set(permissions["ExposedPorts"]) == set(permissions["HostConfig"]["PortBindings"]) == {"8700/tcp"}
+    command = typer.main.get_command(app).get_command(None, "serve")
+    known = {option for parameter in command.params for option in parameter.opts}
+    assert {word for word in permissions["Cmd"] if word.startswith("--")} <= known

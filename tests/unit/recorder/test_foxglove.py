@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -23,7 +24,10 @@ from terrafix.core.log_lines import MessageLog
 from terrafix.recorder import foxglove
 from terrafix.recorder.foxglove import FOXGLOVE_CHANNELS, FoxgloveMessages, LogLevel, Stamped
 
-PUBLISHED = {message.DESCRIPTOR.full_name: message for message in (CompressedImage, LocationFix, Log, PoseInFrame)}
+PUBLISHED = {
+    message.DESCRIPTOR.full_name: message
+    for message in (CompressedImage, ImageAnnotations, LocationFix, Log, PoseInFrame)
+}
 JSON_TYPES = {
     FieldDescriptor.CPPTYPE_STRING: "string",  # bytes too: base64
     FieldDescriptor.CPPTYPE_DOUBLE: "number",
@@ -33,8 +37,8 @@ JSON_TYPES = {
 }
 
 
-def derived(*messages: m.Message) -> list[tuple[str, Stamped]]:
-    source = FoxgloveMessages()
+def derived(*messages: m.Message) -> list[tuple[str, Stamped | foxglove.ImageAnnotations]]:
+    source = FoxgloveMessages(32)
     return [found for message in messages for found in source.of(message)]
 
 
@@ -66,7 +70,7 @@ def check_schema(schema: dict[str, Any], published: Descriptor) -> None:
         if field.message_type is not None and field.message_type.full_name == "google.protobuf.Timestamp":
             assert node["title"] == "time" and sorted(node["properties"]) == ["nsec", "sec"]
         elif field.message_type is not None:
-            check_schema(node, field.message_type)
+            check_schema(node["items"] if field.is_repeated else node, field.message_type)
         elif node["type"] == "array":
             assert field.is_repeated and node["items"]["type"] == JSON_TYPES[field.cpp_type]
         else:
@@ -111,6 +115,31 @@ def test_pose_is_in_metres_about_the_origin_with_the_orientation_of_the_body() -
     assert (at.x, at.y, at.z) == pytest.approx((40.0, 25.0, 600.0), abs=1e-6)
     assert (turn.w, turn.x, turn.y, turn.z) == given.q_w_b
     assert ORIGIN.to_wgs84(at.x, at.y) == pytest.approx((given.lat_deg, given.lon_deg), abs=1e-9)
+
+
+def test_matches_are_drawn_where_the_lens_shows_their_points_in_the_thumbnail() -> None:
+    camera = m.Camera(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5, distortion=(-0.2, 0.0, 0.0, 0.0))
+    start = msgspec.structs.replace(origin(), camera=camera)
+    match = m.MapMatch(
+        t_ns=PERIOD_NS,
+        frame_id=1,
+        verdict=m.Verdict.ACCEPTED,
+        matcher="gradient",
+        matches=[(0.0, 0.0, 1, 2, 3, 1), (0.5, 0.0, 1, 2, 3, 1)],
+    )
+    for verdict, colour in ((m.Verdict.ACCEPTED, foxglove.USED), (m.Verdict.AMBIGUOUS, foxglove.NOT_USED)):
+        found = derived(start, msgspec.structs.replace(match, verdict=verdict))
+        (drawn,) = [message for topic, message in found if topic == "/matches"]
+        assert isinstance(drawn, foxglove.ImageAnnotations)
+        (points,) = drawn.points
+        assert points.timestamp == foxglove.Time.of(PERIOD_NS) and points.outline_color == colour  # that of the image
+        u_px = 31.5 + 60.0 * 0.5 * (1.0 - 0.2 * 0.25)  # OpenCV's k1; then at half the size
+        pixels = [(15.5, 11.5), ((u_px + 0.5) / 2 - 0.5, 11.5)]
+        assert np.array([(point.x, point.y) for point in points.points]) == pytest.approx(np.array(pixels), abs=0.06)
+        ParseDict(
+            {"points": [{"type": 1, "points": [{"x": p.x, "y": p.y} for p in points.points]}]}, ImageAnnotations()
+        )
+    assert "/matches" not in dict(derived(start, msgspec.structs.replace(match, matches=[])))
 
 
 def test_recorded_image_is_base64_of_the_file(recorded: dict[str, list[tuple[str, dict[str, Any]]]]) -> None:

@@ -57,13 +57,19 @@ def test_init_writes_files_that_are_read_without_a_mistake(tmp_path: Path, monke
     camera = camera_of(Path(config.source.camera), read_description(Path(config.source.camera)))
     assert (camera.width, camera.fx) == (1280, pytest.approx(914.0, abs=0.1))  # 640 / tan(35 degrees)
     assert (tmp_path / "my/autopilot.param").read_text() == (ROOT / "config/vehicles/copter.param").read_text()
-    assert "preflight --simulate --config my/config.toml" in (tmp_path / "my/CHECKLIST.md").read_text()
+    assert "preflight --simulate copter --config my/config.toml" in (tmp_path / "my/CHECKLIST.md").read_text()
     for name in ("config.toml", "camera.toml"):
         schema = (tmp_path / "my" / name).read_text().splitlines()[0].removeprefix("#:schema ")
         assert (tmp_path / "my" / schema).is_file()
     checked = call("config", "check", "my/config.toml")
     assert "my/config.toml: configuration, no mistake found" in checked.output
     assert "[link] device = /dev/ttyTHS1" in checked.output and "focal length 914.0 px" in checked.output
+
+
+def test_beside_a_receiver_terrafix_is_the_second_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    call("init", "my", *OPTIONS, "--vehicle", "second-gps")
+    assert load([Path("my/config.toml")]).link.gps_id == 1  # as second-gps.param wants it
 
 
 def test_init_overwrites_nothing(tmp_path: Path) -> None:
@@ -121,21 +127,47 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(conversation, name, value)
 
 
-@pytest.mark.parametrize("name", sorted(WRONG))
-def test_the_wrong_parameter_of_the_practice_is_the_only_one_that_preflight_complains_of(name: str) -> None:
-    practice = Practice(name)
-    context = Context(LinkSection(), plane=False, sysid=1, delay_ms=5, firmware=(4, 6))
+@pytest.mark.parametrize(("vehicle", "name"), [(vehicle, name) for vehicle, names in WRONG.items() for name in names])
+def test_the_wrong_parameter_of_the_practice_is_the_only_one_that_preflight_complains_of(
+    vehicle: str, name: str
+) -> None:
+    practice = Practice(vehicle, name)
+    link = LinkSection(gps_id=1 if vehicle == "second-gps" else 0)
+    context = Context(link, plane=vehicle == "plane", sysid=1, delay_ms=5, firmware=(4, 6))
     lines = list(check_parameters(practice.values, context))
-    assert [line.check for line in lines if line.status is not CheckStatus.OK] == [name]
+    (wrong,) = [line for line in lines if line.status is not CheckStatus.OK]
+    assert wrong.check == name and wrong.change is not None and wrong.change.new != practice.values[name]
 
 
-def test_practice_with_write_sets_the_parameter_right(quick: None, tmp_path: Path) -> None:
-    result = call("preflight", "--simulate", "--write", "--yes", "--out", tmp_path)
+def test_practice_with_write_sets_the_parameter_right(
+    quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call("init", "my", *OPTIONS, "--vehicle", "plane").exception is None
+    practice = ("--simulate", "plane", "--config", "my/config.toml")
+    assert " ".join(practice) in Path("my/CHECKLIST.md").read_text(encoding="utf-8")
+    result = call("preflight", *practice, "--write", "--yes")
     assert "\nFound: it was " in result.output and result.exit_code == 0
 
 
 def test_practice_needs_no_link(tmp_path: Path) -> None:
-    assert isinstance(call("preflight", "--simulate", "--link", "udpin:0.0.0.0:1").exception, UsageError)
+    assert isinstance(call("preflight", "--simulate", "copter", "--link", "udpin:0.0.0.0:1").exception, UsageError)
+
+
+def test_practice_knows_no_px4_and_reads_the_configuration_first(tmp_path: Path) -> None:
+    error = call("preflight", "--simulate", "px4").exception
+    assert isinstance(error, UsageError) and "choose one of copter, plane, second-gps" in str(error)
+    result = call("preflight", "--simulate", "plane", "--config", tmp_path / "none.toml")
+    assert isinstance(result.exception, ConfigError) and result.output == ""
+
+
+def test_the_checklist_of_px4_has_no_practice_with_an_ardupilot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = call("init", "my", *OPTIONS, "--vehicle", "px4")
+    assert "next     my/CHECKLIST.md" in result.output
+    assert "--simulate" not in Path("my/CHECKLIST.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

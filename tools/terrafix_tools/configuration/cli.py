@@ -12,10 +12,12 @@ app = typer.Typer(no_args_is_help=True, help="Configuration files: check, keys, 
 QUESTIONS = {
     "vehicle": "What flies? copter, plane (ArduPilot, Terrafix alone), second-gps (beside a receiver), px4",
     "camera": "Address of the camera: csi://0, /dev/video0, rtsp://...",
-    "size": "Size of its images in pixels, such as 1280x720",
-    "fov": "Horizontal field of view in degrees",
+    "size": "Size of its images in pixels",
+    "fov": "Horizontal field of view in degrees, by the data sheet of the lens",
     "link": "Connection to the autopilot: /dev/ttyTHS1, udpin:0.0.0.0:14550, ...",
 }
+# What Enter takes; what flies and the lens have to be known.
+DEFAULTS = {"camera": "/dev/video0", "size": "1280x720", "link": "/dev/ttyTHS1"}
 
 
 def init(
@@ -32,9 +34,10 @@ def init(
     from terrafix_tools.configuration.first_files import FirstAnswers, Vehicle, write_first_files
     from terrafix_tools.installation import command
 
-    given = {"vehicle": vehicle, "camera": camera, "link": link}
+    given = {"vehicle": vehicle, "camera": camera}
     if not lens:
         given |= {"size": size, "fov": f"{fov:g}" if fov else ""}
+    given["link"] = link
     answers = {name: value or _ask(name) for name, value in given.items()}
     if answers["vehicle"] not in set(Vehicle):
         raise UsageError(f"--vehicle {answers['vehicle']}: choose one of {', '.join(Vehicle)}")
@@ -52,13 +55,16 @@ def init(
     )
     for path in files:
         typer.echo(f"written  {path}")
-    typer.echo(f"next     {command()} preflight --simulate --config {files[0]}")
+    if answers["vehicle"] == Vehicle.PX4:
+        typer.echo(f"next     {files[2]}")
+    else:
+        typer.echo(f"next     {command()} preflight --simulate {answers['vehicle']} --config {files[0]}")
 
 
 def _ask(name: str) -> str:
     if not sys.stdin.isatty():
         raise UsageError(f"--{name} is missing; give it, or call 'terrafix init' in a terminal, where it asks")
-    return str(typer.prompt(QUESTIONS[name])).strip()
+    return str(typer.prompt(QUESTIONS[name], default=DEFAULTS.get(name))).strip()
 
 
 def _degrees(text: str) -> float:

@@ -109,6 +109,7 @@ def _config(folder: Path, answers: FirstAnswers) -> str:
         f"[map]\npath = {text(answers.map_path)}\n\n"
         f"[source]\npath = {text(answers.camera)}\ncamera = {text(folder / CAMERA_FILE)}\n\n"
         f"[link]\ndevice = {text(answers.link)}\n"
+        + ("gps_id = 1  # the second receiver of the autopilot\n" if answers.vehicle is Vehicle.SECOND_GPS else "")
     )
 
 
@@ -116,7 +117,9 @@ def _checklist(folder: Path, answers: FirstAnswers) -> str:
     run, config = command(), folder / CONFIG_FILE
     firmware = answers.vehicle is not Vehicle.PX4
     steps = [
-        f"Practise: `{run} preflight --simulate --config {config}`; one parameter of that autopilot is wrong.",
+        f"Practise: `{run} preflight --simulate {answers.vehicle} --config {config}`; one parameter is wrong."
+        if firmware
+        else f"The camera and its image: `{run} camera show {answers.camera} --camera {folder / CAMERA_FILE}`.",
         f"The lens is {'described' if answers.lens else 'nominal'}. Calibrate it: `{run} camera calibrate`, then "
         f"`{run} config check {config}` ({docs_page('camera.md')}).",
         f"The map covers the whole route: `{run} map check {answers.map_path or 'MAP.gpkg'}`"
@@ -125,7 +128,8 @@ def _checklist(folder: Path, answers: FirstAnswers) -> str:
         f"Parameters of the autopilot: load `{folder / PARAMETERS}` with the ground station, restart."
         if firmware
         else f"Parameters of PX4: {docs_page('autopilot.md')}.",
-        f"At the vehicle, motors off: `{run} preflight --config {config} --mission PLAN` without FAIL.",
+        f"At the vehicle, motors off: `{run} preflight --config {config} --mission PLAN` without FAIL"
+        + ("." if firmware else ", but for what it asks of an ArduPilot: it does not know the parameters of PX4."),
         f"On the ground, sky covered: `{run} run --config {config} --out out/ground`; the pilot sees GPS of Terrafix.",
         "First flights: a receiver stays first, Terrafix second (`second-gps`); another person can take over by hand.",
         f"After each flight: `{run} report out/FLIGHT`, `{run} log autopilot out/FLIGHT LOG.bin`.",

@@ -15,7 +15,7 @@ from terrafix_tools.console.problems import problem
 COOKIE = "terrafix_token"
 SAFE = ("GET", "HEAD", "OPTIONS")
 OPEN = ("/session", "/page", "/favicon.ico")  # the page itself has no data; it asks for the token
-UPLOAD = "/images/batch"  # bounded where it is read
+UPLOADS = ("/images/batch", "/photos")  # ends of paths; bounded where they are read
 BODY_S = 30.0  # longest time of another body [spec: docs/console.md]
 SECURITY_HEADERS = {
     "x-content-type-options": "nosniff",
@@ -45,7 +45,7 @@ class Guard:
             return  # there are no web sockets
         headers = Headers(scope=scope)
         refused = self._refusal(scope, headers)
-        is_upload = scope["path"].endswith(UPLOAD)
+        is_upload = scope["path"].endswith(UPLOADS)
         length = headers.get("content-length", "0")
         if refused is None and not is_upload and (not length.isdecimal() or int(length) > self._body_bytes):
             refused = 413, f"the body is larger than {self._body_bytes} bytes"

@@ -411,6 +411,13 @@ class Recordings(BaseModel):
     files: list[RecordingFile]
 
 
+class ExportChoice(BaseModel):
+    """What a flight can be exported as, and which positions it has, the best first."""
+
+    formats: list[str]
+    which: list[str]
+
+
 class ServiceHealth(BaseModel):
     """``workers``: flights that are computed now; ``waiting``: flights that wait for one of ``max_workers``."""
 

@@ -1,8 +1,10 @@
 """What photos state of the flight that they are to become: the source `terrafix replay` would open, from their first
 bytes and a flight.toml, and where each number comes from."""
 
+import asyncio
 import math
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from starlette.requests import Request
@@ -16,22 +18,32 @@ from terrafix.vision.sources.photos import UNKNOWN_TOLERANCE_DEG, Photos, report
 from terrafix_tools.console.payloads import Camera, Mount, PhotoFact, PhotoFacts, Start, Telemetry
 from terrafix_tools.console.problems import Refusal
 from terrafix_tools.console.settings import ServiceLimits
-from terrafix_tools.console.uploads import DESCRIPTION, IMAGES, read_parts
+from terrafix_tools.console.uploads import DESCRIPTION, IMAGES, Slots, drain, parts_in_time
 
 FLIGHT_TOML = "flight.toml"
+HEAD_BYTES = 256 * 1024  # of a photo: EXIF and XMP are before them [spec: docs/console.md]
 
 
-async def photo_facts(request: Request, limits: ServiceLimits) -> PhotoFacts:
-    """The first bytes (256 kB are enough) of up to a batch of photos, and a flight.toml. Raises Refusal."""
-    with tempfile.TemporaryDirectory(prefix="photos-") as folder, tempfile.TemporaryDirectory() as incoming:
-        parts = await read_parts(request, Path(incoming), limits)
+async def photo_facts(request: Request, limits: ServiceLimits, slots: Slots) -> PhotoFacts:
+    """The first bytes of up to a batch of photos, and a flight.toml. Raises Refusal."""
+    heads = replace(limits, image_bytes=HEAD_BYTES)
+    with (
+        slots.one(),
+        tempfile.TemporaryDirectory(prefix="photos-") as folder,
+        tempfile.TemporaryDirectory() as incoming,
+    ):
+        try:
+            parts = await parts_in_time(request, Path(incoming), heads)
+        except Refusal:
+            await drain(request)
+            raise
         for i, part in enumerate(part for part in parts if part.field == IMAGES):
             part.path.rename(Path(folder) / f"{i:04d}{Path(part.name).suffix.lower()}")
         for part in parts:
             if part.field == DESCRIPTION:
                 part.path.rename(Path(folder) / FLIGHT_TOML)
         try:
-            return facts_of(Path(folder))
+            return await asyncio.to_thread(facts_of, Path(folder))
         except SourceError as error:
             raise Refusal(422, str(error).replace(f"{folder}/", "").replace(folder, "the photos")) from None
 

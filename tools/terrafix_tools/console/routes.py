@@ -10,6 +10,7 @@ from terrafix import __version__
 from terrafix_tools.console.guard import COOKIE, token_of
 from terrafix_tools.console.payloads import (
     Accepted,
+    ExportChoice,
     Flight,
     FlightConfig,
     Flights,
@@ -29,10 +30,10 @@ from terrafix_tools.console.payloads import (
     Tokens,
     UserFix,
 )
-from terrafix_tools.console.photo_facts import photo_facts
 from terrafix_tools.console.problems import Refusal
 from terrafix_tools.console.service import Service
 from terrafix_tools.console.store import flights
+from terrafix_tools.export.track import BEST
 from terrafix_tools.mission.file import mission_text, track_mission
 
 MAX_PAGE = 1000  # results of one answer [spec: docs/console.md]
@@ -192,7 +193,7 @@ async def upload(request: Request, flight_id: FlightId) -> Accepted:
 @router.post("/photos", openapi_extra=PHOTOS_BODY)
 async def photos(request: Request) -> PhotoFacts:
     """What photos state of their flight, and where each number comes from: for the form of a new flight."""
-    return await photo_facts(request, service_of(request).settings.limits)
+    return await service_of(request).photo_facts(request)
 
 
 @router.post("/flights/{flight_id}/copy", status_code=201)
@@ -306,6 +307,22 @@ def recording(
 ) -> Response:
     path = service_of(request).recording(flight_id, name)
     return FileResponse(path, media_type="application/octet-stream", filename=name)
+
+
+@router.get("/flights/{flight_id}/exports")
+def exports(request: Request, flight_id: FlightId) -> ExportChoice:
+    return service_of(request).export_choice(flight_id)
+
+
+@router.get("/flights/{flight_id}/exports/{kind}", response_class=FileResponse)
+async def export(
+    request: Request,
+    flight_id: FlightId,
+    kind: Annotated[str, InPath(pattern=r"^[a-z0-9]{1,20}$")],
+    which: Annotated[str, Query(pattern=r"^[a-z]{1,20}$")] = BEST,
+) -> Response:
+    """The positions for another program, as a file; of formats that are several files a zip file."""
+    return await service_of(request).export(flight_id, kind, which)
 
 
 # --- maps -----------------------------------------------------------------------------------------

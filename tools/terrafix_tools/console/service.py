@@ -1,6 +1,7 @@
 """The state of a running console and what its routes do."""
 
 import asyncio
+import importlib.util
 import re
 import shutil
 from collections.abc import AsyncIterator
@@ -18,11 +19,13 @@ from terrafix_tools.console.access import Access
 from terrafix_tools.console.areas import AreaMaps, check_area
 from terrafix_tools.console.compute.description import stored_camera, stored_pixel
 from terrafix_tools.console.events import Health, ProcessingBlocked, StateChanged
+from terrafix_tools.console.exports import Exports
 from terrafix_tools.console.feed import Feeds
 from terrafix_tools.console.locating import LocatingProcess, Question
 from terrafix_tools.console.maps import MapStore
 from terrafix_tools.console.payloads import (
     Accepted,
+    ExportChoice,
     Flight,
     FlightConfig,
     FlightKind,
@@ -34,6 +37,7 @@ from terrafix_tools.console.payloads import (
     NewFlight,
     ObjectGps,
     ObjectPixel,
+    PhotoFacts,
     RecordingFile,
     Recordings,
     RouteArea,
@@ -41,12 +45,15 @@ from terrafix_tools.console.payloads import (
     Steered,
     UserFix,
 )
+from terrafix_tools.console.photo_facts import photo_facts
 from terrafix_tools.console.problems import FULL, Refusal
 from terrafix_tools.console.settings import Settings
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import Database
 from terrafix_tools.console.store.flights import StoredEvent
 from terrafix_tools.console.workers import Reports, Workers
+from terrafix_tools.export.formats import FORMATS, Format
+from terrafix_tools.export.track import FINALISED, WHICH
 from terrafix_tools.finalised import TABLE
 
 if TYPE_CHECKING:
@@ -69,6 +76,7 @@ class Service:
         self.live = self._live_flights(settings.bus) if settings.bus is not None else None
         self._areas = AreaMaps(settings.map_folders[0], settings.sources, self._map_done)
         self._locating = LocatingProcess(settings.limits.object_requests)
+        self._exports = Exports()
         self._uploads = uploads.Slots(settings.limits.uploads, "uploads")
         self._stopping = False
 
@@ -167,11 +175,45 @@ class Service:
             raise Refusal(404, f"flight {flight_id} has no file {name}")
         return self._out(self.flight(flight_id)) / name
 
+    def export_choice(self, flight_id: str) -> ExportChoice:
+        flight = self.flight(flight_id)
+        batch, final = flight.kind is FlightKind.BATCH, (self._out(flight) / TABLE).is_file()
+
+        def can(chosen: Format) -> bool:
+            there = not chosen.library or importlib.util.find_spec(chosen.library) is not None
+            return there and (batch or not chosen.needs_photos)
+
+        return ExportChoice(
+            formats=[name for name, chosen in FORMATS.items() if can(chosen)],
+            which=[which for which in WHICH if final or which != FINALISED],
+        )
+
+    async def export(self, flight_id: str, kind: str, which: str) -> Response:
+        def of_flight() -> tuple[Path, str, dict[str, Path]]:
+            flight, choice = self.flight(flight_id), self.export_choice(flight_id)
+            if kind not in choice.formats or which not in choice.which:
+                raise Refusal(404, f"{kind}, {which}: give one of {choice.formats} and of {choice.which}")
+            with self.database.read() as db:
+                images = flights.images_of(db, flight_id, 0, self.settings.limits.images)
+            folder, copied = self.settings.flight(flight_id), FORMATS[kind].needs_photos
+            out = self._out(flight)
+            if not out.is_dir():
+                raise Refusal(409, "no image of this flight is computed yet; export it when there is a position")
+            needed = 2 * sum(image.bytes for image in images) if copied else 0  # copies, and their zip file
+            uploads.check_room(out.parent, self.settings.limits, needed)
+            return out, flight.name or flight_id, {image.name: folder / image.stored for image in images}
+
+        out, title, photos = await asyncio.to_thread(of_flight)
+        return await self._exports.make(out, title, kind, which, photos)
+
     async def events(self, flight_id: str, after: int) -> AsyncIterator[bytes]:
         if self.feeds.clients >= self.settings.limits.event_clients:
             raise Refusal(429, f"{self.settings.limits.event_clients} event streams are the limit; close others")
         flight = await asyncio.to_thread(self.flight, flight_id)
         return self.feeds.of(flight_id).stream(min(after, flight.last_event_id))
+
+    async def photo_facts(self, request: Request) -> PhotoFacts:
+        return await photo_facts(request, self.settings.limits, self._uploads)
 
     # --- acting -----------------------------------------------------------------------------------
 

@@ -179,10 +179,10 @@ async def read_parts(request: Request, folder: Path, limits: ServiceLimits) -> l
     return reader.parts
 
 
-def check_room(folder: Path, limits: ServiceLimits) -> None:
+def check_room(folder: Path, limits: ServiceLimits, needed_bytes: int = 0) -> None:
     """Raises Refusal (507): the disk is almost full."""
     free = shutil.disk_usage(folder).free
-    if free < limits.disk_reserve_bytes:
+    if free < limits.disk_reserve_bytes + needed_bytes:
         raise Refusal(FULL, f"{free // 2**20} MB are free on the disk of the console; delete flights or free space")
 
 
@@ -371,15 +371,20 @@ async def take_batch(
     try:
         with slots.one(), incoming(folder) as temporary:
             check_room(folder, limits)
-            try:
-                async with asyncio.timeout(limits.upload_s):
-                    parts = await read_parts(request, temporary, limits)
-            except TimeoutError:
-                raise Refusal(408, f"the upload took longer than {limits.upload_s:g} s; send smaller batches") from None
+            parts = await parts_in_time(request, temporary, limits)
             return await asyncio.to_thread(store_batch, database, flight_id, folder, parts, limits)
     except Refusal:
         await drain(request)
         raise
+
+
+async def parts_in_time(request: Request, folder: Path, limits: ServiceLimits) -> list[Part]:
+    """As ``read_parts``, within the longest time of an upload."""
+    try:
+        async with asyncio.timeout(limits.upload_s):
+            return await read_parts(request, folder, limits)
+    except TimeoutError:
+        raise Refusal(408, f"the upload took longer than {limits.upload_s:g} s; send smaller batches") from None
 
 
 async def drain(request: Request) -> None:

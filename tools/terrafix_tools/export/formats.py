@@ -19,6 +19,13 @@ class Format:
     ending: str = ""
     is_folder: bool = False
     needs_photos: bool = False
+    library: str = ""  # of an extra, that writes it
+
+    def file_name(self, flight: str, name: str) -> str:
+        """Of an output of the flight; ``name``: of the format. Some programs want a file by one name alone."""
+        if self.ending:
+            return f"{flight}{self.ending}" if self.ending.startswith(".") else self.ending
+        return f"{flight}-{name}" if self.is_folder else f"{flight}-{name}.csv"
 
 
 FORMATS = {
@@ -39,7 +46,7 @@ FORMATS = {
     "opensfm": Format("OpenSfM reconstruction", reconstruction.write_opensfm, "reconstruction.json"),
     "tum": Format("trajectory: t x y z qx qy qz qw", trajectory.write_tum, ".tum"),
     "kitti": Format("trajectory: 3x4 matrices", trajectory.write_kitti, ".kitti"),
-    "rosbag": Format("ROS 2 bag: NavSatFix, PoseWithCovarianceStamped", ros_bag.write_bag, "", True),
+    "rosbag": Format("ROS 2 bag: NavSatFix, PoseWithCovarianceStamped", ros_bag.write_bag, "", True, library="rosbags"),
 }
 
 

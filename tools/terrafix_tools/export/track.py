@@ -127,7 +127,7 @@ def read_track(folder: Path, which: str = BEST) -> Track:
     origin = record.origin
     axes = LocalFrame(*((origin.lat_deg, origin.lon_deg) if origin else (poses[0].lat_deg, poses[0].lon_deg)))
     name = str(read_summary(folder).get("flight") or "") if folder.is_dir() else ""
-    return Track(name or folder.resolve().name, poses, origin.camera if origin else None, axes)
+    return Track(name or folder.absolute().name, poses, origin.camera if origin else None, axes)
 
 
 def _of(which: str) -> str:

@@ -44,7 +44,7 @@ def write_page(fleet: Path, out: Path) -> None:
 
 def page(tables: FleetTables, fleet: Path) -> str:
     name = fleet.resolve().name
-    parts = (_head(tables, name), _months(tables), _trends(tables), _reasons(tables), _places(tables), _errors(tables))
+    parts = (_head(tables, name), months(tables), _trends(tables), _reasons(tables), _places(tables), _errors(tables))
     return kit.document(f"{name} - fleet", "", *parts)
 
 
@@ -66,7 +66,7 @@ def _head(tables: FleetTables, name: str) -> str:
     return kit.header("Terrafix fleet", name, dates) + kit.figures(tiles)
 
 
-def _months(tables: FleetTables) -> str:
+def months(tables: FleetTables) -> str:
     rows = tables.ask(f"{MONTHS} ORDER BY month").objects()
     if not rows:
         return ""

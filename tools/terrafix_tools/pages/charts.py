@@ -49,9 +49,9 @@ class Chart:
         return self.height - AXIS - (self.height - TOP - AXIS) * _share(value, self.y_min, self.y_max, self.log_y)
 
     def line(self, points: Sequence[Point], css: str) -> None:
-        """Draws a line with gaps where a value is None."""
+        """Draws a line with gaps where a value is None; a point between gaps is a dot."""
         for run in self._runs(points):
-            text = " ".join(f"{x:.1f},{y:.1f}" for x, y in run)
+            text = " ".join(f"{x:.1f},{y:.1f}" for x, y in (run if len(run) > 1 else 2 * run))
             self.marks.append(f'<polyline class="line {css}" points="{text}"/>')
 
     def dots(self, points: Sequence[tuple[float, float]], css: str) -> None:

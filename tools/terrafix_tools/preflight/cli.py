@@ -26,8 +26,9 @@ def preflight(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
     autopilot_only: Annotated[bool, typer.Option("--autopilot-only", help="Skip map, camera and computer.")] = False,
     simulate: Annotated[
-        bool, typer.Option("--simulate", help="Practise: a simulated autopilot, one of whose parameters is wrong.")
-    ] = False,
+        str,
+        typer.Option(help="Practise with a simulated copter, plane or second-gps; one of its parameters is wrong."),
+    ] = "",
     config: Annotated[
         list[Path] | None, typer.Option("--config", help="TOML file; may be given several times.")
     ] = None,
@@ -35,7 +36,7 @@ def preflight(
     """Check autopilot, map, camera and clocks before take-off. Exit code 1: a check failed."""
     from terrafix_tools.preflight.run import preflight as run_preflight
 
-    with _practice(link) if simulate else nullcontext() as practice:
+    with _practice(simulate, link, config or []) if simulate else nullcontext() as practice:
         ready = run_preflight(
             config or [],
             link=practice.device if practice else link,
@@ -46,7 +47,7 @@ def preflight(
             restore=restore,
             yes=yes,
             as_json=as_json,
-            with_computer=not (autopilot_only or simulate),
+            with_computer=not (autopilot_only or practice),
         )
         if practice and not as_json:
             typer.echo(
@@ -57,11 +58,14 @@ def preflight(
     raise typer.Exit(0 if ready else 1)
 
 
-def _practice(link: str) -> Any:
-    """The simulated autopilot. Raises UsageError: there is another."""
+def _practice(vehicle: str, link: str, configs: list[Path]) -> Any:
+    """The simulated autopilot. Raises UsageError: there is another; ConfigError."""
+    from terrafix.core.config import load
     from terrafix_tools.preflight.practice import Practice
 
     if link:
         raise UsageError("--simulate brings its own autopilot; omit --link")
-    typer.echo("A simulated ArduCopter 4.6, on the ground. One of its parameters is wrong: find it.\n", err=True)
-    return Practice()
+    load(configs)
+    practice = Practice(vehicle)
+    typer.echo(f"A simulated {practice.about} 4.6, on the ground. One of its parameters is wrong: find it.\n", err=True)
+    return practice

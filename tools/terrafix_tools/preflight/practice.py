@@ -1,4 +1,4 @@
-"""A simulated ArduCopter on the ground with one wrong parameter, for `terrafix preflight --simulate`."""
+"""A simulated ArduPilot on the ground with one wrong parameter, for `terrafix preflight --simulate`."""
 
 import random
 import socket
@@ -9,33 +9,45 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from terrafix.core.errors import UsageError
 from terrafix.core.installed_files import installed_files
 from terrafix_tools.preflight.simulated import GROUND_DEFAULTS, GroundAutopilot
 
 POLL_S = 0.002
 DATAGRAM_MAX = 4096
 # Values with which an autopilot comes, or which a common mistake leaves; each makes preflight complain.
-WRONG = {
-    "GPS1_TYPE": 1.0,  # looks for a receiver on a serial port
+_OF_ALL = {
     "EK3_SRC1_POSXY": 0.0,  # the EKF takes no position
     "EK3_SRC1_VELXY": 0.0,
     "EK3_GPS_CHECK": 31.0,  # demands a heading that GPS_INPUT does not have
     "EK3_VEL_I_GATE": 300.0,
 }
+_ALONE = _OF_ALL | {"GPS1_TYPE": 1.0}  # looks for a receiver on a serial port
+WRONG = {  # by the file of config/vehicles
+    "copter": _ALONE,
+    "plane": _ALONE | {"AHRS_OPTIONS": 0.0},
+    "second-gps": _OF_ALL | {"GPS2_TYPE": 1.0, "GPS_AUTO_SWITCH": 1.0},
+}
 MISSION = ((mavlink.MAV_CMD_NAV_WAYPOINT, 48.01, 11.0, 100.0),)
 
 
 class Practice:
-    """Context manager: the autopilot listens on ``device`` while it is open. ``wrong``: its wrong parameter; "": one
-    by chance."""
+    """Context manager: the autopilot listens on ``device`` while it is open. ``vehicle``: a key of WRONG; ``wrong``:
+    its wrong parameter; "": one by chance. Raises UsageError."""
 
-    def __init__(self, wrong: str = "") -> None:
-        preset = (installed_files() / "config" / "vehicles" / "copter.param").read_text(encoding="utf-8").splitlines()
-        lines = (line.split(",") for line in preset if line and not line.startswith("#"))
+    def __init__(self, vehicle: str, wrong: str = "") -> None:
+        if vehicle not in WRONG:
+            raise UsageError(
+                f"--simulate {vehicle}: choose one of {', '.join(WRONG)}; parameters of others are not known"
+            )
+        preset = (installed_files() / "config" / "vehicles" / f"{vehicle}.param").read_text(encoding="utf-8")
+        lines = (line.split(",") for line in preset.splitlines() if line and not line.startswith("#"))
         self._right = GROUND_DEFAULTS | {name: float(value) for name, value in lines}
-        self.wrong = wrong or random.choice(sorted(WRONG))
+        self.wrong = wrong or random.choice(sorted(WRONG[vehicle]))
+        kind = mavlink.MAV_TYPE_FIXED_WING if vehicle == "plane" else mavlink.MAV_TYPE_QUADROTOR
+        self.about = "ArduPlane" if vehicle == "plane" else "ArduCopter"
         self._autopilot = GroundAutopilot(
-            self._right | {self.wrong: WRONG[self.wrong]}, kind=mavlink.MAV_TYPE_QUADROTOR, mission=MISSION
+            self._right | {self.wrong: WRONG[vehicle][self.wrong]}, kind=kind, mission=MISSION
         )
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="practice-autopilot", daemon=True)

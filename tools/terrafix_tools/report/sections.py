@@ -106,8 +106,8 @@ def _cumulative(view: FlightView) -> str:
 def _accuracy_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     def pair(key: str, scale: float, unit: str) -> str:
         values = [metrics.get(key), metrics.get(f"refined_{key}") if metrics.get("refined") else None]
-        texts = [f"{scale * v:.1f} {unit}" for v in values if v is not None]
-        return " → ".join(texts) if texts else "-"
+        texts = [f"{scale * v:.1f}\u00a0{unit}" for v in values if v is not None]
+        return " →\u00a0".join(texts) if texts else "-"
 
     rows = [(f"within {limit} m", pair(f"within_{limit}m", 100, "%")) for limit in (5, 10, 20, 50)]
     rows += [("median error", pair("median_m", 1, "m")), ("95 % of errors below", pair("p95_m", 1, "m"))]

@@ -58,7 +58,7 @@ def figures(view: FlightView) -> list[Figure]:
         if metrics["median_m"] is not None:
             shown.append(Figure(f"{metrics['median_m']:.1f}", "m", "median error"))
             coverage = metrics["ellipse95_coverage"]
-            mood = "good" if 0.9 <= coverage <= 0.99 else "fair" if coverage > 0.85 else "bad"
+            mood = "good" if coverage >= 0.9 else "fair" if coverage > 0.85 else "bad"
             shown.append(Figure(f"{100 * coverage:.0f}", "%", "truth inside the 95 % ellipse", mood))
         false = metrics["false_fixes"]
         shown.append(Figure(str(false), "", "false fixes over 50 m", "good" if false == 0 else "bad"))

@@ -59,8 +59,10 @@ def test_a_tile_server_becomes_a_package_and_a_second_build_fetches_nothing(tmp_
         assert out is not None
         request = len(server.requests)
         assert request == 30 and "12 of 30 there, 18 to fetch" in output.getvalue()
+        assert output.getvalue().endswith(f"written to {out}\n")
         first = out.read_bytes()
-        build_order(order(tmp_path, server.url))
+        build_order(order(tmp_path, server.url, say=console(output)))
+        assert output.getvalue().endswith(f"written to {out}, which was replaced\n")
         assert len(server.requests) == request and out.read_bytes() == first
     assert_shows_the_world(out)
     package = MapPackage.open(out, verify=True)

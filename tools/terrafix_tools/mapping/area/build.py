@@ -101,6 +101,7 @@ def build_order(order: Order) -> Path | None:
         scratch = stack.enter_context(made)
         elevation = _elevation(order, area, Path(scratch))
         vectors = _vectors(order, area)
+        replaced = ", which was replaced" if order.out.is_file() else ""
         package = build_package(
             layers,
             order.out,
@@ -117,6 +118,7 @@ def build_order(order: Order) -> Path | None:
         order.say.print(statement.text(), highlight=False)
     order.say.print(f"{package}: written; 'terrafix map preview {package}' draws it", highlight=False)
     opened.close()
+    order.say.print(f"{package.stat().st_size / 1e6:.1f} MB; written to {package}{replaced}", highlight=False)
     return package
 
 

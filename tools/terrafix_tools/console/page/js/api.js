@@ -1,5 +1,7 @@
 // Requests to the service (docs/console.md). A refusal is a Problem with the service's own words.
 
+import {h} from "./dom.js";
+
 const HEAD_BYTES = 256 * 1024; // of a photo: EXIF and XMP are before them
 
 export class Problem extends Error {
@@ -19,19 +21,16 @@ async function problemOf(response) {
   return new Problem(response.status, detail);
 }
 
-async function request(method, path, body) {
-  let response;
-  try {
-    response = await fetch(path, {
-      method,
-      credentials: "same-origin",
-      headers: body === undefined ? {} : {"content-type": "application/json"},
-      body: body === undefined ? undefined : JSON.stringify(body),
-    });
-  } catch {
-    throw new Problem(0, "the service does not answer");
-  }
+/** The answer of the service. Throws Problem. */
+async function answer(path, options = {}) {
+  const response = await fetch(path, {credentials: "same-origin", ...options}).catch(() => { throw new Problem(0, "the service does not answer"); });
   if (!response.ok) throw await problemOf(response);
+  return response;
+}
+
+async function request(method, path, body) {
+  const json = body === undefined ? {} : {headers: {"content-type": "application/json"}, body: JSON.stringify(body)};
+  const response = await answer(path, {method, ...json});
   return response.status === 204 ? null : response.json();
 }
 
@@ -40,9 +39,18 @@ export async function photoFacts(photos, description) {
   const form = new FormData();
   for (const {name, get: bytes} of photos) form.append("images", (await bytes()).slice(0, HEAD_BYTES), name);
   if (description !== null) form.append("description", new Blob([description]), "flight.toml");
-  const response = await fetch("/photos", {method: "POST", credentials: "same-origin", body: form});
-  if (!response.ok) throw await problemOf(response);
-  return response.json();
+  return (await answer("/photos", {method: "POST", body: form})).json();
+}
+
+/** Saves what the service makes, by the name that it gives. -> the name. A refusal is not saved. */
+export async function download(path) {
+  const response = await answer(path);
+  const given = response.headers.get("content-disposition");
+  const name = decodeURIComponent(/filename\*=utf-8''(.*)/.exec(given)?.[1] ?? /filename="(.*)"/.exec(given)[1]);
+  const url = URL.createObjectURL(await response.blob());
+  h("a", {href: url, download: name}).click();
+  setTimeout(() => URL.revokeObjectURL(url), 60000);
+  return name;
 }
 
 export const get = (path) => request("GET", path);

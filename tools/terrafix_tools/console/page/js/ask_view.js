@@ -13,8 +13,8 @@ import {words} from "./words.js";
 const HINT_M = 500; // default radius of a hint
 
 export class AskView {
-  /** ``heading``: of the top of the image, null: not known. */
-  constructor(flight, request, info, heading) {
+  /** ``file``: name of the image; ``heading``: of its top, null: not known. */
+  constructor(flight, request, info, file, heading) {
     Object.assign(this, {flight, request, info, heading, pixel: null, place: null, small: []});
     this.frame = new FrameView((at) => { this.pixel = at; this.update(); });
     this.mapBox = h("div", {class: "ask-map", role: "application", "aria-label": t("map")});
@@ -24,7 +24,7 @@ export class AskView {
     this.hint = h("button", {onclick: () => this.coarse()}, t("send_hint"));
     this.tiles = h("ol", {class: "places", "aria-label": t("best_places")});
     this.dialog = h("dialog", {class: "ask", "aria-labelledby": "ask-title"},
-      h("header", {}, h("h1", {id: "ask-title"}, t("ask_title", request.file || number(request.frame_id))), h("button", {onclick: () => this.close(), "aria-label": t("close")}, "×")),
+      h("header", {}, h("h1", {id: "ask-title"}, t("ask_title", file || number(request.frame_id))), h("button", {onclick: () => this.close(), "aria-label": t("close")}, "×")),
       h("p", {class: "soft"}, t("ask_how")),
       h("div", {class: "ask-panes"}, h("section", {}, h("h2", {}, t("ask_step1")), this.frame.element), h("section", {}, h("h2", {}, t("ask_step2")), this.mapBox)),
       this.tiles,

@@ -41,9 +41,3 @@ export function toast(text, isError = false) {
   document.body.append(box);
   if (!isError) toastTimer = setTimeout(() => box.remove(), 6000);
 }
-
-export function download(name, type, text) {
-  const url = URL.createObjectURL(new Blob([text], {type}));
-  h("a", {href: url, download: name}).click();
-  setTimeout(() => URL.revokeObjectURL(url), 10000);
-}

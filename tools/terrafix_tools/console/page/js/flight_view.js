@@ -2,23 +2,21 @@
 
 import {allResults, get, post} from "./api.js";
 import {AskView} from "./ask_view.js";
-import {download, fill, h, say, toast} from "./dom.js";
-import {csv, geoJson} from "./export.js";
-import {bytes, clock, coordinate, metres, number, seconds} from "./format.js";
+import {fill, h, say, toast} from "./dom.js";
+import {clock, coordinate, metres, number, seconds} from "./format.js";
 import {FrameView} from "./frame_view.js";
 import {Glance} from "./glance.js";
 import {stateBadge} from "./list_view.js";
 import {MapView} from "./map_view.js";
 import {FlightModel} from "./model.js";
-import {uploads, startUpload} from "./new_view.js";
-import {LogPanel, ObjectPanel, OverviewPanel, VehiclePanel, VerdictPanel} from "./panels.js";
+import {ExportPanel, LogPanel, ObjectPanel, OverviewPanel, VehiclePanel, VerdictPanel} from "./panels.js";
 import {mayAct} from "./session.js";
 import {SOURCES, sign} from "./sources.js";
 import {EventStream} from "./stream.js";
 import {t} from "./texts.js";
 import {words} from "./words.js";
 import {compareNames, sorted} from "./photos.js";
-import {BATCH, readTable} from "./upload.js";
+import {BATCH, readTable, startUpload, uploads} from "./upload.js";
 
 const EARLIER_EVENTS = 1000; // that are read again when a flight is opened: the logs keep as many
 const REFRESH_MS = 1000; // between two readings of the flight itself, and of live images
@@ -68,6 +66,7 @@ export class FlightView {
     fill(this.main, main);
     this.mapView = new MapView(this.mapBox, this.info, (id) => this.select(id));
     this.mapView.onFollow = () => this.followButton.setAttribute("aria-pressed", "false");
+    this.mapView.map.on("resize", () => { this.dirty = true; }); // what it has to show is fitted anew
     this.mapView.onMeasure = (text) => { this.measured.textContent = text; };
   }
 
@@ -127,7 +126,7 @@ export class FlightView {
   tabs() {
     this.objects = new ObjectPanel();
     this.panels = {overview: new OverviewPanel(this.actions()), ...(this.model.isLive ? {vehicle: new VehiclePanel()} : {}),
-      verdicts: new VerdictPanel(), log: new LogPanel(), objects: this.objects, export: {element: this.exports(), update() {}}};
+      verdicts: new VerdictPanel(), log: new LogPanel(), objects: this.objects, export: new ExportPanel(`/flights/${this.flightId}`)};
     const names = Object.keys(this.panels);
     const list = h("div", {class: "tabs", role: "tablist"});
     const show = (name, focus = false) => {
@@ -140,7 +139,7 @@ export class FlightView {
       }
       if (focus) list.children[names.indexOf(name)].focus();
       this.dirty = true;
-      if (name === "export") this.listRecordings();
+      if (name === "export") this.panels.export.list();
     };
     this.showTab = show;
     names.forEach((name) => {
@@ -167,31 +166,6 @@ export class FlightView {
     this.askButton = h("button", {onclick: () => this.help()}, t("give_position"));
     const copy = this.model.isLive ? null : h("a", {class: "button", href: `#/new/${this.flightId}`}, t("duplicate"));
     return h("div", {class: "actions"}, this.more, this.moreLabel, this.completeButton, this.askButton, copy);
-  }
-
-  exports() {
-    const give = (refined, kind) => async () => {
-      try {
-        const results = await allResults(this.flightId, refined);
-        const name = `${this.flightId}-${refined ? "refined" : "immediate"}`;
-        if (kind === "csv") download(`${name}.csv`, "text/csv", csv(results));
-        else download(`${name}.geojson`, "application/geo+json", geoJson(results));
-      } catch (error) {
-        toast(error.message, true);
-      }
-    };
-    const row = (label, refined) => h("p", {class: "actions"}, h("span", {}, label), h("button", {onclick: give(refined, "csv")}, "CSV"), h("button", {onclick: give(refined, "geojson")}, "GeoJSON"));
-    this.files = h("ul", {class: "lines"});
-    return h("div", {}, row(t("refined_results"), true), row(t("immediate_results"), false), h("h3", {}, t("recordings")), this.files);
-  }
-
-  async listRecordings() {
-    try {
-      const {files} = await get(`/flights/${this.flightId}/recordings`);
-      fill(this.files, files.length ? files.map((file) => h("li", {}, h("a", {href: file.url, download: file.name}, file.name), ` ${bytes(file.bytes)}`)) : h("li", {class: "soft"}, t("none_yet")));
-    } catch (error) {
-      fill(this.files, h("li", {class: "soft"}, error.message));
-    }
   }
 
   // --- what comes ----------------------------------------------------------------------------------
@@ -247,7 +221,7 @@ export class FlightView {
     this.uploading = Boolean(uploads.get(this.flightId)?.running);
     const {model} = this;
     const {flight} = model;
-    fill(this.middle, h("strong", {class: "flight-name"}, flight.name || flight.flight_id), stateBadge(flight),
+    fill(this.middle, h("h1", {class: "flight-name"}, flight.name || flight.flight_id), stateBadge(flight),
       h("span", {class: `badge link ${model.connection}`}, t(`link_${model.connection}`)));
     this.glance.update(model);
     this.showLost();
@@ -260,7 +234,7 @@ export class FlightView {
     this.panels[this.tab].update(model);
     if (this.more) {
       const open = !model.isLive && flight.state !== "completed";
-      this.moreLabel.hidden = this.more.disabled = this.completeButton.hidden = !open;
+      this.moreLabel.hidden = this.more.hidden = !open;
       this.more.disabled = !open || this.uploading;
       this.completeButton.hidden = !open || flight.completing;
       this.askButton.hidden = flight.state === "completed" || !model.newest;
@@ -369,7 +343,8 @@ export class FlightView {
   help() {
     if (this.ask) return;
     const request = this.model.request ?? {frame_id: this.shown.frame_id, candidate_tiles: []};
-    this.ask = new AskView(this.model.flight, request, this.info, this.topOf(this.model.results.get(request.frame_id)));
+    const result = this.model.results.get(request.frame_id);
+    this.ask = new AskView(this.model.flight, request, this.info, result?.file, this.topOf(result));
     this.ask.onClosed = () => { this.ask = null; };
     this.ask.onSent = (path, body) => {
       this.mapView.addMark(body, body.radius_m ?? 5);

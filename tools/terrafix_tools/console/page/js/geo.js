@@ -39,15 +39,3 @@ export function square(centre, half) {
   const to = shifted(centre, half, half);
   return [[from.lat, from.lon], [to.lat, to.lon]];
 }
-
-/** [lon, lat] around an ellipse, closed. */
-export function ellipseRing(centre, ellipse, steps = 48) {
-  const b = ellipse.bearing_deg * RAD;
-  return Array.from({length: steps + 1}, (_, i) => {
-    const angle = 2 * Math.PI * (i % steps) / steps;
-    const along = ellipse.semi_major_m * Math.cos(angle);
-    const across = ellipse.semi_minor_m * Math.sin(angle);
-    const p = shifted(centre, along * Math.sin(b) + across * Math.cos(b), along * Math.cos(b) - across * Math.sin(b));
-    return [p.lon, p.lat];
-  });
-}

@@ -74,7 +74,7 @@ export class Glance {
         cell(t("ellipse95"), ellipse ? `${number(ellipse.semi_major_m, digits)} × ${number(ellipse.semi_minor_m, digits)} m` : NONE,
           ellipse ? t("within20", unit(100 * within20(ellipse), 0, "%")) : t("not_known"),
           ellipse && ellipse.semi_major_m > 100 ? "warn" : "", ellipse ? ellipseSign(ellipse) : null),
-        this.lastMatch(model, fresh),
+        model.flight.state === "completed" ? null : this.lastMatch(model, fresh),
         cell(t("height_heading"), `${unit(fix?.agl_m, 0, "m")} · ${degrees(fix?.heading)}`,
           fresh ? t("speed", unit(fresh.position.speed_mps, 1, "m/s")) : t("amsl", unit(fix?.altitude, 0, "m"))),
         cell(t("frame"), h("span", {class: "name", title: frame.file}, frame.file || number(frame.frame_id)), stale ? t("as_of", clock(model.updatedAt ?? model.openedAt)) : this.age(model), stale ? "bad" : ""));

@@ -32,7 +32,7 @@ function bar() {
   const out = session.required && session.role
     ? h("button", {onclick: signOut}, `${t(`role_${session.role}`)} · ${t("sign_out")}`) : null;
   return h("header", {class: "bar"},
-    h("a", {class: "brand", href: "#/"}, h("img", {src: "icon.svg", alt: "", width: 26, height: 26}), h("span", {}, "Terrafix")),
+    h("a", {class: "brand", href: "#/", "aria-label": "Terrafix"}, h("img", {src: "icon.svg", alt: "", width: 26, height: 26}), h("span", {}, "Terrafix")),
     h("div", {class: "bar-middle", id: "bar-middle"}),
     h("button", {class: "menu", "aria-label": t("menu"), "aria-expanded": "false", onclick: (event) => {
       event.target.setAttribute("aria-expanded", String(document.querySelector(".bar nav").classList.toggle("open")));

@@ -19,6 +19,9 @@ export function baseMap(element, info, options = {}) {
     ...options,
   });
   map.attributionControl?.setPrefix(false);
+  const resized = new ResizeObserver(() => map.invalidateSize({animate: false}));
+  resized.observe(element);
+  map.on("unload", () => resized.disconnect());
   if (info) {
     const [west, south, east, north] = info.bounds;
     const bounds = L.latLngBounds([south, west], [north, east]);

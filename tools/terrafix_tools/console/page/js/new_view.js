@@ -8,28 +8,7 @@ import {number} from "./format.js";
 import {dropped, sorted} from "./photos.js";
 import {t} from "./texts.js";
 import {words} from "./words.js";
-import {BATCH, Upload, readTable} from "./upload.js";
-
-/** Uploads that run, by flight: the view of the flight shows them. */
-export const uploads = new Map();
-const warn = (event) => event.preventDefault();
-
-export async function startUpload(flightId, photos, table) {
-  const upload = new Upload(flightId, photos, table);
-  uploads.set(flightId, upload);
-  upload.running = true;
-  addEventListener("beforeunload", warn);
-  try {
-    await upload.run();
-    return true;
-  } catch {
-    return false; // the card tells why
-  } finally {
-    upload.running = false;
-    if (![...uploads.values()].some((one) => one.running)) removeEventListener("beforeunload", warn);
-    setTimeout(() => { if (uploads.get(flightId) === upload) uploads.delete(flightId); }, 8000);
-  }
-}
+import {BATCH, readTable, startUpload} from "./upload.js";
 
 /** So many of a list as may be asked about, from the first to the last. */
 const spread = (list, most) => (list.length <= most ? list : Array.from({length: most}, (_, i) => list[Math.round(i * (list.length - 1) / (most - 1))]));
@@ -43,54 +22,73 @@ export class NewView {
   async open() {
     const [{maps}, {service}, old] = await Promise.all([get("/maps"), get("/config"), this.copied ? get(`/flights/${this.copied}`) : null]);
     this.maps = maps;
-    const field = (id, attributes = {}) => {
-      const note = h("span", {class: "from", id: `from-${id}`});
-      const input = h("input", {id: `f-${id}`, type: "number", step: "any", inputmode: "decimal", "aria-describedby": `from-${id}`, ...attributes});
-      input.addEventListener("input", () => { this.notes[id].textContent = t("by_hand"); });
-      this[id] = input;
-      this.notes[id] = note;
-      return h("div", {class: "field"}, h("label", {for: `f-${id}`}, t(`f_${id}`)), input, note);
-    };
-    this.map = h("select", {id: "f-map", onchange: () => this.showMap()}, this.maps.map((one) => h("option", {value: one.name}, one.name)));
-    this.route = h("textarea", {id: "f-route", rows: 3, spellcheck: "false", placeholder: "48.1372, 11.5755"});
-    const area = [h("p", {class: "soft"}, t("route_why")), h("div", {class: "field"}, h("label", {for: "f-route"}, t("f_route")), this.route),
-      h("div", {class: "fields"}, field("corridor_m", {value: 1000, min: 100, max: 20000}))];
-    const chooser = (id, attributes) => {
-      const input = h("input", {id: `f-${id}`, type: "file", multiple: true, class: "unseen", onchange: () => this.take(input.files), ...attributes});
-      return [input, h("label", {class: "button", for: `f-${id}`}, t(`f_${id}`))];
-    };
+    this.wrong = h("p", {class: "error", role: "alert"});
+    const form = h("form", {class: "page new", onsubmit: (event) => this.submit(event)}, h("h1", {}, t(old ? "copy_flight" : "new_flight")),
+      this.photosPart(old), this.cameraPart(), this.placePart(service.areas),
+      this.wrong, h("p", {}, h("button", {class: "primary", disabled: !this.maps.length && !service.areas}, t(old ? "compute_again" : "create_and_upload"))));
+    if (!old) this.takeDrops(form);
+    fill(this.main, form);
+    if (old) this.fillFrom(await this.spec(), t("from_copied"));
+    if (this.maps.length) this.showMap();
+    for (const input of [this.lat, this.lon]) input.addEventListener("change", () => this.mark());
+  }
+
+  // --- parts ---------------------------------------------------------------------------------------
+
+  /** A labelled number with a line that says where it comes from. */
+  field(id, attributes = {}) {
+    const note = h("span", {class: "from", id: `from-${id}`});
+    const input = h("input", {id: `f-${id}`, type: "number", step: "any", inputmode: "decimal", "aria-describedby": `from-${id}`, ...attributes});
+    input.addEventListener("input", () => { note.textContent = t("by_hand"); });
+    this[id] = input;
+    this.notes[id] = note;
+    return h("div", {class: "field"}, h("label", {for: `f-${id}`}, t(`f_${id}`)), input, note);
+  }
+
+  chooser(id, attributes) {
+    const input = h("input", {id: `f-${id}`, type: "file", multiple: true, class: "unseen", onchange: () => this.take(input.files), ...attributes});
+    return [input, h("label", {class: "button", for: `f-${id}`}, t(`f_${id}`))];
+  }
+
+  photosPart(old) {
     this.complete = h("input", {id: "f-complete", type: "checkbox", checked: true});
     this.chosen = h("p", {role: "status"}, old ? t("copied_photos", number(old.images.uploaded), old.name) : t("drop_here"));
     this.facts = h("details", {hidden: true});
-    this.wrong = h("p", {class: "error", role: "alert"});
+    return h("fieldset", {class: "drop"}, h("legend", {}, t("photos")), old ? null : [h("p", {class: "soft"}, t("photos_why", BATCH[0])),
+      h("div", {class: "actions"}, this.chooser("images", {accept: "image/jpeg,image/png,.zip,.toml,.csv"}), this.chooser("folder", {webkitdirectory: true}))],
+      this.chosen, this.facts, this.field("name", {type: "text", maxlength: 100, inputmode: "text"}),
+      old ? null : h("label", {class: "check"}, this.complete, h("span", {}, t("f_complete"))));
+  }
+
+  cameraPart() {
+    return h("fieldset", {}, h("legend", {}, t("camera")), h("div", {class: "fields"},
+      this.field("width", {min: 640, max: 6252, required: true}), this.field("height", {min: 480, max: 4168, required: true}),
+      this.field("fx", {min: 1}), this.field("focal_mm", {min: 0.1}), this.field("sensor_width_mm", {min: 0.1}),
+      this.field("pitch_deg", {value: -90, min: -90, max: 0}), this.field("mount_yaw_deg", {value: 0}), this.field("tolerance_deg", {value: 10, min: 1, max: 90})));
+  }
+
+  /** Map, or route whose map is fetched, and start. */
+  placePart(areas) {
+    this.map = h("select", {id: "f-map", onchange: () => this.showMap()}, this.maps.map((one) => h("option", {value: one.name}, one.name)));
+    this.route = h("textarea", {id: "f-route", rows: 3, spellcheck: "false", placeholder: "48.1372, 11.5755"});
     this.picture = h("div", {class: "pick-map"});
-    const form = h("form", {class: "page new", onsubmit: (event) => this.submit(event)}, h("h1", {}, t(old ? "copy_flight" : "new_flight")),
-      h("fieldset", {class: "drop"}, h("legend", {}, t("photos")), old ? null : [h("p", {class: "soft"}, t("photos_why", BATCH[0])),
-        h("div", {class: "actions"}, chooser("images", {accept: "image/jpeg,image/png,.zip,.toml,.csv"}), chooser("folder", {webkitdirectory: true}))],
-        this.chosen, this.facts, field("name", {type: "text", maxlength: 100, inputmode: "text"}),
-        old ? null : h("label", {class: "check"}, this.complete, h("span", {}, t("f_complete")))),
-      h("fieldset", {}, h("legend", {}, t("camera")), h("div", {class: "fields"},
-        field("width", {min: 640, max: 6252, required: true}), field("height", {min: 480, max: 4168, required: true}),
-        field("fx", {min: 1}), field("focal_mm", {min: 0.1}), field("sensor_width_mm", {min: 0.1}),
-        field("pitch_deg", {value: -90, min: -90, max: 0}), field("mount_yaw_deg", {value: 0}), field("tolerance_deg", {value: 10, min: 1, max: 90}))),
-      h("fieldset", {}, h("legend", {}, t("map_and_start")), this.maps.length
-        ? h("div", {class: "field"}, h("label", {for: "f-map"}, t("map")), this.map) : h("p", {class: service.areas ? "soft" : "error"}, t("no_maps")),
-        service.areas ? area : [],
+    const corridor = h("div", {class: "fields"}, this.field("corridor_m", {value: 1000, min: 100, max: 20000}));
+    return h("fieldset", {}, h("legend", {}, t("map_and_start")), this.maps.length
+      ? h("div", {class: "field"}, h("label", {for: "f-map"}, t("map")), this.map) : h("p", {class: areas ? "soft" : "error"}, t("no_maps")),
+      areas ? [h("p", {class: "soft"}, t("route_why")), h("div", {class: "field"}, h("label", {for: "f-route"}, t("f_route")), this.route), corridor] : [],
       h("p", {class: "soft"}, t("start_why")), this.picture, h("div", {class: "fields"},
-        field("lat", {min: -90, max: 90}), field("lon", {min: -180, max: 180}), field("sigma_m", {value: 10, min: 0.1}),
-        field("agl_m", {min: 1}), field("yaw_deg", {min: 0, max: 360}))),
-      this.wrong, h("p", {}, h("button", {class: "primary", disabled: !this.maps.length && !service.areas}, t(old ? "compute_again" : "create_and_upload"))));
+        this.field("lat", {min: -90, max: 90}), this.field("lon", {min: -180, max: 180}), this.field("sigma_m", {value: 10, min: 0.1}),
+        this.field("agl_m", {min: 1}), this.field("yaw_deg", {min: 0, max: 360})));
+  }
+
+  takeDrops(form) {
     form.addEventListener("dragover", (event) => { event.preventDefault(); form.classList.add("over"); });
     form.addEventListener("dragleave", () => form.classList.remove("over"));
     form.addEventListener("drop", (event) => {
       event.preventDefault();
       form.classList.remove("over");
-      if (!old) dropped(event.dataTransfer).then((files) => this.take(files));
+      dropped(event.dataTransfer).then((files) => this.take(files));
     });
-    fill(this.main, form);
-    if (old) this.fillFrom(await this.spec(), t("from_copied"));
-    if (this.maps.length) this.showMap();
-    for (const input of [this.lat, this.lon]) input.addEventListener("change", () => this.mark());
   }
 
   close() {

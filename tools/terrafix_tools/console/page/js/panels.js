@@ -1,6 +1,7 @@
 // The tabs beside the map.
 
-import {fill, h} from "./dom.js";
+import {download, get} from "./api.js";
+import {fill, h, toast} from "./dom.js";
 import {NONE, bytes, clock, coordinate, metres, number, unit} from "./format.js";
 import {freshFacts} from "./glance.js";
 import {t} from "./texts.js";
@@ -45,8 +46,8 @@ export class OverviewPanel {
     const parts = flight.fragments.map((one) => [number(one.fragment_id), `${one.first_frame} – ${one.last_frame}`, number(one.frames),
       one.joined ? t("joined") : td("warn", t("not_joined"))]);
     const source = model.facts?.source;
-    const said = source ? [h("h3", {}, t("source_said")), pairs(source.map((one) => [one.topic, one.text]))] : null;
-    fill(this.figures, pairs(rows), h("h3", {}, t("fragments")), table([t("fragment"), t("frames"), t("count"), t("tie")], parts, t("none_yet")), said);
+    const said = source ? [h("h2", {}, t("source_said")), pairs(source.map((one) => [one.topic, one.text]))] : null;
+    fill(this.figures, pairs(rows), h("h2", {}, t("fragments")), table([t("fragment"), t("frames"), t("count"), t("tie")], parts, t("none_yet")), said);
   }
 }
 
@@ -85,17 +86,17 @@ export class VehiclePanel {
     const has = position.fix === "3D";
     const gnss = Object.entries(autopilot.gnss).map(([receiver, one]) => [receiver,
       td(one.state === "spoofed" ? "bad" : one.state === "trusted" ? "good" : "", t(`gnss_${one.state}`)), metres(one.distance_m), words(one.why)]);
-    return [h("h3", {}, t("sent_title")), pairs([
+    return [h("h2", {}, t("sent_title")), pairs([
       [t("sent_fix"), has ? t("fix_3d") : `${t("fix_none")}: ${words(position.reason)}`, has ? "good" : "bad"],
       [t("accuracy"), has ? `± ${metres(position.accuracy_m)}` : NONE], [t("estimate_age"), unit(position.estimate_age_ms, 0, "ms")],
-      [t("degradation"), position.degradation ?? NONE], [t("covariance"), position.covariance_mode ?? NONE], [t("resets"), number(position.resets)],
+      [t("degradation"), position.degradation || NONE], [t("covariance"), position.covariance_mode ?? NONE], [t("resets"), number(position.resets)],
       [t("messages"), t("messages_line", number(autopilot.sent), number(autopilot.received), number(autopilot.bad_bytes), number(autopilot.refused))]]),
-    h("h3", {}, t("autopilot")), pairs([
+    h("h2", {}, t("autopilot")), pairs([
       [t("link"), autopilot.connected ? autopilot.autopilot : t("no_autopilot"), autopilot.connected ? "good" : "bad"],
       [t("uses"), autopilot.uses_position === null ? NONE : autopilot.uses_position ? t("yes") : t("no"), autopilot.uses_position === false ? "bad" : ""],
       [t("ekf_ratio"), number(autopilot.position_test_ratio, 2)], [t("ekf_source"), autopilot.position_source ?? NONE]]),
-    h("h3", {}, t("gnss")), table([t("receiver"), t("state"), t("distance"), t("why")], gnss, t("no_gnss")),
-    texts.length ? [h("h3", {}, t("texts")), h("ul", {class: "lines"}, texts.map((text) => h("li", {}, text)))] : null];
+    h("h2", {}, t("gnss")), table([t("receiver"), t("state"), t("distance"), t("why")], gnss, t("no_gnss")),
+    texts.length ? [h("h2", {}, t("texts")), h("ul", {class: "lines"}, texts.map((text) => h("li", {}, text)))] : null];
   }
 
   computer(facts) {
@@ -105,14 +106,14 @@ export class VehiclePanel {
       unit(one.idle_s, 1, "s"), percent(one.load), number(one.restarts), one.last_event]);
     const rates = Object.entries(facts.rates_hz).map(([name, rate]) => [name, unit(rate, 1, "Hz")]);
     const dropped = Object.entries(facts.dropped).map(([name, count]) => [name, number(count), "warn"]);
-    return [h("h3", {}, t("processes")), table([t("process"), t("state"), t("progress"), t("load"), t("restarts"), t("last_event")], processes, t("none_yet")),
-      h("h3", {}, t("heat")), pairs([
+    return [h("h2", {}, t("processes")), table([t("process"), t("state"), t("progress"), t("load"), t("restarts"), t("last_event")], processes, t("none_yet")),
+      h("h2", {}, t("heat")), pairs([
         [t("temperature"), [unit(computer.temperature_c, 1, "°C"), computer.band ? ` · ${computer.band}` : ""], hot ? "bad" : ""],
         [t("throttled"), computer.throttled === null ? NONE : computer.throttled ? t("yes") : t("no"), computer.throttled ? "bad" : ""],
         [t("load"), percent(computer.load)], [t("power"), unit(computer.power_w, 1, "W")],
         [t("disk"), computer.disk_free_mb === null ? NONE : bytes(computer.disk_free_mb * 1e6)]]),
-      h("h3", {}, t("rates")), pairs([...rates, [t("delay"), unit(facts.delay_ms, 0, "ms")], [t("accepted_share"), percent(facts.map_matches_accepted)]]),
-      h("h3", {}, t("dropped")), dropped.length ? pairs(dropped) : h("p", {class: "soft"}, t("nothing_dropped"))];
+      h("h2", {}, t("rates")), pairs([...rates, [t("delay"), unit(facts.delay_ms, 0, "ms")], [t("accepted_share"), percent(facts.map_matches_accepted)]]),
+      h("h2", {}, t("dropped")), dropped.length ? pairs(dropped) : h("p", {class: "soft"}, t("nothing_dropped"))];
   }
 }
 
@@ -160,3 +161,43 @@ export class ObjectPanel {
   }
 }
 
+/** ``path``: of the flight. */
+export class ExportPanel {
+  constructor(path) {
+    this.path = path;
+    const field = (id) => {
+      this[id] = h("select", {id: `export-${id}`});
+      return h("div", {class: "field"}, h("label", {for: `export-${id}`}, t(`export_${id}`)), this[id]);
+    };
+    this.button = h("button", {class: "primary", onclick: () => this.export()}, t("export_now"));
+    this.files = h("ul", {class: "lines"});
+    this.element = h("div", {}, field("format"), field("which"), h("p", {class: "actions"}, this.button), h("p", {class: "soft"}, t("export_why")),
+      h("h2", {}, t("recordings")), this.files);
+  }
+
+  update() {}
+
+  /** What there is now. */
+  async list() {
+    try {
+      const [{formats, which}, {files}] = await Promise.all([get(`${this.path}/exports`), get(`${this.path}/recordings`)]);
+      for (const [select, names] of [[this.format, formats], [this.which, which]]) {
+        if (select.options.length !== names.length) fill(select, names.map((name) => h("option", {value: name}, t(`export_${name}`))));
+      }
+      fill(this.files, files.length ? files.map((file) => h("li", {}, h("a", {href: file.url, download: file.name}, file.name), ` ${bytes(file.bytes)}`)) : h("li", {class: "soft"}, t("none_yet")));
+    } catch (error) {
+      fill(this.files, h("li", {class: "soft"}, error.message));
+    }
+  }
+
+  async export() {
+    this.button.disabled = true;
+    try {
+      toast(t("export_made"));
+      toast(t("export_done", await download(`${this.path}/exports/${this.format.value}?which=${this.which.value}`)));
+    } catch (error) {
+      toast(error.message, true);
+    }
+    this.button.disabled = false;
+  }
+}

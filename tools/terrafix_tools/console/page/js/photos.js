@@ -103,6 +103,6 @@ export async function sorted(files) {
   };
   const photos = kept.filter(({path}) => IMAGE.test(path));
   const single = new Set(photos.map(({path}) => nameOf(path))).size === photos.length;
-  const named = photos.map((photo) => ({...photo, name: single ? nameOf(photo.path) : photo.path.replaceAll("/", " ")}));
+  const named = photos.map((photo) => ({...photo, name: single ? nameOf(photo.path) : photo.path.replaceAll("/", "_")}));
   return {photos: named.sort((a, b) => compareNames(a.name, b.name)), table: await text("frames.csv"), description: await text("flight.toml")};
 }

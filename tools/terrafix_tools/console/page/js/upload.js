@@ -92,3 +92,24 @@ export class Upload {
     this.line.textContent = [t("upload_line", number(batch + 1), number(batches), bytes(sent), bytes(this.total)), left].filter(Boolean).join(" · ");
   }
 }
+
+/** Uploads that run, by flight: the view of the flight shows them. */
+export const uploads = new Map();
+const warn = (event) => event.preventDefault();
+
+export async function startUpload(flightId, photos, table) {
+  const upload = new Upload(flightId, photos, table);
+  uploads.set(flightId, upload);
+  upload.running = true;
+  addEventListener("beforeunload", warn);
+  try {
+    await upload.run();
+    return true;
+  } catch {
+    return false; // the card tells why
+  } finally {
+    upload.running = false;
+    if (![...uploads.values()].some((one) => one.running)) removeEventListener("beforeunload", warn);
+    setTimeout(() => { if (uploads.get(flightId) === upload) uploads.delete(flightId); }, 8000);
+  }
+}
