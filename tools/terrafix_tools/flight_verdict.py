@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafix.link.integrity.fix_type import DEGRADATION_LEVELS, MAX_HORIZONTAL_SIGMA_M
-from terrafix.link.pilot_text.statustext import fault_text
+from terrafix.link.pilot_text.statustext import LINK_FAULTS, fault_text
 from terrafix.messages import CalibrationFault, MeasurementVerdict, Origin, SourceLabel, Verdict
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import NS, Row, RowTable
@@ -22,8 +22,8 @@ MAX_UNANCHORED_S = DEGRADATION_LEVELS[-1][0]  # longest time without a map match
 MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejected by the estimator's innovation gate
 # Faults that begin in flight; all others are of the description, which was wrong from the beginning.
 BEGIN_IN_FLIGHT = ("registration", "picture upside down", "picture turned", "picture mirrored")
-# Faults whose pictures were refused: the position went on without them, at a claim of its own.
-REFUSED = ("picture frozen", "picture contradicts motion", "picture without texture")
+# Faults whose frames or telemetry were left out: the position went on without them, at a claim of its own.
+REFUSED = ("picture frozen", "picture contradicts motion", "picture without texture", *LINK_FAULTS)
 # One of map and initial position is wrong; no measurement on board decides which.
 START_CONTRADICTS_MAP = "start and map contradict each other: one of them is in the wrong place"
 MAX_SHOWN_SPANS = 3
@@ -44,7 +44,7 @@ class FlightVerdict:
     files: tuple[tuple[str, str], ...] = ()
     untrusted_files: tuple[tuple[str, str], ...] = ()
     untrusted: tuple[tuple[float, float, str], ...] = ()  # as ``spans``, of the rest: from, to, reason
-    refused: tuple[tuple[float, float, str], ...] = ()  # of refused pictures, whatever was trusted: from, to, which
+    refused: tuple[tuple[float, float, str], ...] = ()  # of inputs left out, whatever was trusted: from, to, which
 
     @property
     def label(self) -> str:
