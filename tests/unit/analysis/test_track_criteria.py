@@ -56,4 +56,4 @@ def test_a_fault_is_reported_by_its_cause_and_named_by_the_verdict() -> None:
     named = replace(found, refused=[Span(8.0, 16.0, "picture frozen")], untrusted=[Span(16.0, 18.0, "no position")])
     assert measured([named])["in the verdict"] == "0 s" and measured([named])["trusted and wrong"] == "1"
     other = replace(named, cause="upside down")
-    assert other.reported_s() == other.verdict_s() == float("inf") and replace(named, cause="").told_s() is None
+    assert other.reported_s() == other.verdict_s() == float("inf") and replace(named, cause="").reported_s() is None
