@@ -107,6 +107,7 @@ PROCESSES: tuple[Process, ...] = (
             m.GpsInput,
             m.MeasurementVerdict,
             m.LinkStatus,
+            m.CalibrationFault,
             m.ServedVehicle,
             m.CandidateAttitude,
             m.GnssReading,

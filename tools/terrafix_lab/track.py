@@ -22,8 +22,8 @@ class Track:
     """``t_s`` (N,), ``error_m`` (N,) horizontal, nan: no position; ``nees`` (N,); ``sigma_m`` (N,) claimed, of the
     worst axis. ``fault``: its span; None: no input is false. ``frames_s``: times of the frames, if not ``t_s``.
 
-    Of a flight with a record: ``told``: when the pilot got which text; ``untrusted``: spans that the verdict of the
-    report does not trust, with its reason; ``refused``: those in which it names the pictures that were not used;
+    Of a flight with a record: ``texts``: when the pilot got which; ``untrusted``: spans that the verdict of the
+    report does not trust, with its reason; ``refused``: those in which it names inputs that were left out;
     ``cause``: regular expression for what both call the fault."""
 
     t_s: np.ndarray
@@ -32,7 +32,7 @@ class Track:
     sigma_m: np.ndarray
     fault: Span | None
     frames_s: Sequence[float] = ()
-    told: Sequence[tuple[float, str]] = ()
+    texts: Sequence[tuple[float, str]] = ()
     untrusted: Sequence[Span] = ()
     refused: Sequence[Span] = ()
     cause: str = ""
@@ -71,9 +71,9 @@ class Track:
         again_s = self.again_s()
         return again_s is not None and again_s < math.inf
 
-    def told_s(self) -> float | None:
+    def reported_s(self) -> float | None:
         """From the beginning of the fault to the first text with its cause; inf: never; None: it has no cause."""
-        return self._named_s([t_s for t_s, text in self.told if re.search(self.cause, text)])
+        return self._named_s([t_s for t_s, text in self.texts if re.search(self.cause, text)])
 
     def verdict_s(self) -> float | None:
         """From the beginning of the fault to where the verdict names its cause; inf: nowhere; None: it has none."""
@@ -85,7 +85,7 @@ class Track:
 
     def trusted_wrong(self) -> float | None:
         """Positions beyond LATE_M and 3 sigma that the verdict of the report trusts; None: there is no report."""
-        if not self.told and not self.untrusted:
+        if not self.texts and not self.untrusted:
             return None
         trusted = [not any(span.has(t_s) for span in self.untrusted) for t_s in self.t_s.tolist()]
         return float((self.is_false(LATE_M) & np.array(trusted, bool)).sum())
@@ -113,8 +113,9 @@ CRITERIA = {
         lambda track: float(track.is_late(LATE_M).sum()), sum),
     "right again": TrackCriterion(
         "from the end of the fault until within 20 m and claimed to 30 m (95 %), three in a row", "s", Track.again_s),
-    "told": TrackCriterion(
-        "from the beginning of the fault to the text to the pilot that names its cause", "s", Track.told_s, live=True),
+    "reported": TrackCriterion(
+        "from the beginning of the fault to the text to the pilot that names its cause", "s", Track.reported_s,
+        live=True),
     "in the verdict": TrackCriterion(
         "from the beginning of the fault to the span that the verdict names by its cause", "s", Track.verdict_s,
         live=True),
@@ -126,7 +127,7 @@ CRITERIA = {
 def measured(tracks: Sequence[Track]) -> dict[str, str]:
     """Of one flight or of several together: name of CRITERIA -> value with its unit; "-": not measurable."""
     found = {}
-    live = any(track.told or track.untrusted for track in tracks)
+    live = any(track.texts or track.untrusted for track in tracks)
     for name, row in CRITERIA.items():
         if row.live and not live:
             continue

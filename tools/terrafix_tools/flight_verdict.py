@@ -8,8 +8,10 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from terrafix.core.clock import NS_PER_S
+from terrafix.link.ground_station.prior_request import MIN_DURATION_NS, MIN_FRAMES, UNANCHORED_SHARE
 from terrafix.link.integrity.fix_type import DEGRADATION_LEVELS, MAX_HORIZONTAL_SIGMA_M
-from terrafix.link.pilot_text.statustext import fault_text
+from terrafix.link.pilot_text.statustext import LINK_FAULTS, fault_text
 from terrafix.messages import CalibrationFault, MeasurementVerdict, Origin, SourceLabel, Verdict
 from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import NS, Row, RowTable
@@ -22,8 +24,8 @@ MAX_UNANCHORED_S = DEGRADATION_LEVELS[-1][0]  # longest time without a map match
 MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejected by the estimator's innovation gate
 # Faults that begin in flight; all others are of the description, which was wrong from the beginning.
 BEGIN_IN_FLIGHT = ("registration", "picture upside down", "picture turned", "picture mirrored")
-# Faults whose pictures were refused: the position went on without them, at a claim of its own.
-REFUSED = ("picture frozen", "picture contradicts motion", "picture without texture")
+# Faults whose frames or telemetry were left out: the position went on without them, at a claim of its own.
+REFUSED = ("picture frozen", "picture contradicts motion", "picture without texture", *LINK_FAULTS)
 # One of map and initial position is wrong; no measurement on board decides which.
 START_CONTRADICTS_MAP = "start and map contradict each other: one of them is in the wrong place"
 MAX_SHOWN_SPANS = 3
@@ -44,7 +46,8 @@ class FlightVerdict:
     files: tuple[tuple[str, str], ...] = ()
     untrusted_files: tuple[tuple[str, str], ...] = ()
     untrusted: tuple[tuple[float, float, str], ...] = ()  # as ``spans``, of the rest: from, to, reason
-    refused: tuple[tuple[float, float, str], ...] = ()  # of refused pictures, whatever was trusted: from, to, which
+    asks: tuple[float, float, str] | None = None  # for a position between these times, with the reason
+    refused: tuple[tuple[float, float, str], ...] = ()  # of inputs left out, whatever was trusted: from, to, which
 
     @property
     def label(self) -> str:
@@ -63,7 +66,8 @@ class FlightVerdict:
         untrusted, refused = (
             tuple((a - zero_s, b - zero_s, why) for a, b, why in given) for given in (self.untrusted, self.refused)
         )
-        return replace(self, spans=spans, untrusted=untrusted, refused=refused)
+        asks = self.asks and (self.asks[0] - zero_s, self.asks[1] - zero_s, self.asks[2])
+        return replace(self, spans=spans, untrusted=untrusted, refused=refused, asks=asks)
 
     def text(self) -> str:
         """One line for the operator."""
@@ -71,6 +75,9 @@ class FlightVerdict:
         refused += ["..."] if len(self.refused) > MAX_SHOWN_SPANS else []
         because = f" ({'; '.join([*self.reasons, *refused])})" if self.reasons or refused else ""
         cause = f" Likely cause: {self.cause}." if self.cause else ""
+        if self.asks is not None:
+            from_s, to_s, why = self.asks
+            cause += f" From {from_s:.1f} s to {to_s:.1f} s {why}: a user fix or a hint there would help."
         if not self.spans or self.share == 1.0:
             return f"{self.label.capitalize()}{because}.{cause}"
         names = self.files or (("", ""),) * len(self.spans)
@@ -93,6 +100,7 @@ class FlightVerdict:
             "untrusted_files": [list(pair) for pair in self.untrusted_files],
             "trusted_share": round(self.share, 6),
             "reasons": self.reasons,
+            "asks_s": None if self.asks is None else [round(self.asks[0], 3), round(self.asks[1], 3), self.asks[2]],
             "active_faults": self.active_faults,
             "cause": self.cause,
             "text": self.text(),
@@ -151,8 +159,9 @@ def flight_verdict(
     cause = likely_cause(len(rows), anchored, (fault for _, fault in ordered), verdict_counts)
     names = [_fault_name(fault) for _, fault in active.values() if fault.quantity not in REFUSED]
     return FlightVerdict(
-        spans, share, reasons, names, cause, tuple(files[True]), tuple(files[False]), tuple(untrusted), tuple(refused)
-    )
+        spans, share, reasons, names, cause, tuple(files[True]), tuple(files[False]), tuple(untrusted),
+        refused=tuple(refused), asks=_asks(rows),
+    )  # fmt: skip
 
 
 def verdict_of(folder: Path, zero_s: float | None = None) -> FlightVerdict:
@@ -172,6 +181,19 @@ def verdict_of(folder: Path, zero_s: float | None = None) -> FlightVerdict:
             verdicts[message.measurement][str(message.verdict)] += 1
     found = flight_verdict(list(table.rows.values()), faults, verdicts)
     return found.since(zero_s or 0.0)
+
+
+def _asks(rows: Sequence[Row]) -> tuple[float, float, str] | None:
+    """The longest stretch without a map match, if it is as long as the pilot would be asked for, and a fifth of the
+    frames: from, to, and how many frames."""
+    stretches = [list(group) for found, group in groupby(rows, key=lambda row: row.anchor_age_ms == 0) if not found]
+    longest = max(stretches, key=len, default=[])
+    if len(longest) < max(MIN_FRAMES, UNANCHORED_SHARE * len(rows)):
+        return None
+    from_s, to_s = longest[0].t_s, longest[-1].t_s
+    if to_s - from_s < MIN_DURATION_NS / NS_PER_S:
+        return None
+    return from_s, to_s, f"no map match in {len(longest)} of {len(rows)} frames"
 
 
 def _moment(t_s: float, file: str) -> str:

@@ -152,7 +152,7 @@ class MavlinkEdge:
                 self._autopilot.telemetry.restore(self._checkpoint.restored, now_ns)
         for message, sender in self._connection.messages(now_ns):
             messages += self._on_packet(message, sender, now_ns)
-        messages += self._admission.verdicts(now_ns)
+        messages += self._admission.rejections(now_ns)
         messages += [self._send_warning(text, now_ns) for text in self._admission.pilot_texts(now_ns)]
         messages += self._ground.poll(now_ns, self._served.sysid)
         if self._connection.reopened != self._known_reopened:  # on a new connection all streams are requested again

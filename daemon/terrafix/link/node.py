@@ -22,7 +22,15 @@ from terrafix.link.output.gps_time import LatchedClock
 from terrafix.link.output.send_schedule import SendSchedule
 from terrafix.link.pilot_text.debounce import Debounce
 from terrafix.link.pilot_text.frame_load import FrameLoad
-from terrafix.link.pilot_text.statustext import CRITICAL, INFO, NOTICE, WARNING, fault_text, statustext
+from terrafix.link.pilot_text.statustext import (
+    CRITICAL,
+    INFO,
+    LINK_FAULTS,
+    NOTICE,
+    WARNING,
+    fault_text,
+    statustext,
+)
 from terrafix.messages import (
     NO_FRAME_ID,
     CalibrationFault,
@@ -152,7 +160,8 @@ class LinkNode:
         return self._send(now_ns) if self._schedule.due(now_ns) else ()
 
     def _on_frame(self, frame: Frame) -> list[Message]:
-        return [*self._frame_load.on_frame(frame)]
+        faults = self._frame_load.on_frame(frame)
+        return [*faults, *(text for fault in faults for text in self._on_calibration_fault(fault))]
 
     def _on_estimate(self, estimate: NavEstimate) -> list[Message]:
         now_ns = max(self._now_ns, estimate.emitted_at_ns)  # the last tick may be older than the estimate
@@ -252,7 +261,8 @@ class LinkNode:
         return [statustext(hint.t_ns, INFO if hint.verdict is Verdict.ACCEPTED else WARNING, hint.text)]
 
     def _on_calibration_fault(self, fault: CalibrationFault) -> list[Message]:
-        return [statustext(fault.t_ns, CRITICAL if fault.active else INFO, fault_text(fault))]
+        warning = WARNING if fault.quantity in LINK_FAULTS else CRITICAL
+        return [statustext(fault.t_ns, warning if fault.active else INFO, fault_text(fault))]
 
     def _on_served_vehicle(self, served: ServedVehicle) -> list[Message]:
         self._candidates = served.candidates

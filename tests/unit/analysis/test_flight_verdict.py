@@ -188,3 +188,16 @@ def test_pictures_that_were_not_used_are_named_with_their_span_and_leave_the_tru
     assert verdict.since(5.0).as_json()["refused_s"] == [[15.0, 30.0, "picture frozen"]]
     open_end = flight_verdict(rows(), frozen[:1])
     assert open_end.refused == ((20.0, 59.0, "picture frozen"),) and not open_end.active_faults
+
+
+@pytest.mark.parametrize(("lost", "asks"), [(11, False), (12, True), (60, True)])
+def test_a_flight_without_a_map_match_along_a_fifth_of_its_frames_asks_for_a_position_when_it_is_through(
+    lost: int, asks: bool
+) -> None:
+    flown = rows()
+    for row in flown[:lost]:
+        row.anchor_age_ms = None if lost == 60 else 1000 * (int(row.t_s) + 1)
+    verdict = flight_verdict(flown)
+    why = f"no map match in {lost} of 60 frames"
+    assert verdict.since(1.0).as_json()["asks_s"] == ([-1.0, lost - 2.0, why] if asks else None)
+    assert verdict.text().endswith(f"{why}: a user fix or a hint there would help.") is asks

@@ -49,11 +49,11 @@ def test_the_time_to_notice_ends_at_the_last_false_position_after_the_beginning(
     assert track({5: 90.0}, fault=FAULT).notice_s() is None and track({5: 90.0}).notice_s() is None
 
 
-def test_a_fault_is_told_by_its_cause_and_named_by_the_verdict() -> None:
-    told = [(9.0, "picture frozen"), (12.0, "3D fix"), (14.0, "picture frozen: not used")]
-    found = replace(track({15: 25.0, 17: 25.0}, fault=FAULT), told=told, cause="picture frozen")
-    assert measured([found])["told"] == "4 s" and found.verdict_s() == float("inf")
+def test_a_fault_is_reported_by_its_cause_and_named_by_the_verdict() -> None:
+    texts = [(9.0, "picture frozen"), (12.0, "3D fix"), (14.0, "picture frozen: not used")]
+    found = replace(track({15: 25.0, 17: 25.0}, fault=FAULT), texts=texts, cause="picture frozen")
+    assert measured([found])["reported"] == "4 s" and found.verdict_s() == float("inf")
     named = replace(found, refused=[Span(8.0, 16.0, "picture frozen")], untrusted=[Span(16.0, 18.0, "no position")])
     assert measured([named])["in the verdict"] == "0 s" and measured([named])["trusted and wrong"] == "1"
     other = replace(named, cause="upside down")
-    assert other.told_s() == other.verdict_s() == float("inf") and replace(named, cause="").told_s() is None
+    assert other.reported_s() == other.verdict_s() == float("inf") and replace(named, cause="").reported_s() is None

@@ -37,7 +37,7 @@ def test_a_record_tells_the_tilt_of_the_mount_that_its_description_lacks(tmp_pat
     assert any(line.startswith("time: 60 frames, 2 a second, jitter of the interval 0.0 ms") for line in lines)
 
 
-def test_rate_jitter_latency_and_offset_of_the_stamps_are_told() -> None:
+def test_rate_jitter_latency_and_offset_of_the_stamps_are_shown() -> None:
     times, rng = CameraTimes(), np.random.default_rng(2)
     stamps_s = np.delete(np.arange(200) * 0.1 + rng.normal(0.0, 0.003, 200), 50)
     for i, t_s in enumerate(stamps_s.tolist()):

@@ -296,7 +296,7 @@ def test_a_cell_hands_each_part_of_a_fault_to_its_own_and_takes_it_back(
     outcome, track = run._fly(rig, fault, Phase.CRUISE, 0.5)  # type: ignore[arg-type]
     assert (hit, "edited") in rig.edits and [e for e in rig.edits if e[1] == "edited"] == [(hit, "edited")]
     assert rig.edits[-2:] == [("camera", "true"), ("telemetry", "true")]
-    assert track.told and outcome.texts[0].endswith(" s: picture frozen")
+    assert track.texts and outcome.texts[0].endswith(" s: picture frozen")
     assert outcome.fixes > 90 and outcome.wrong == 0 and outcome.back_s == 0.0
     assert outcome.criteria["late sure over 20 m"] == "0" and outcome.criteria["right again"].endswith("s")
 

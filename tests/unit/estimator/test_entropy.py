@@ -31,3 +31,5 @@ def test_after_the_last_map_match_the_entropy_of_a_position_is_that_of_the_frame
     for entropy in (immediate, refined):
         gained = {i: entropy[parent] - entropy[i] for i, parent in refers_to.items()}
         assert max(gained.values()) < GAIN_NATS, max(gained, key=lambda i: gained[i])
+        since_match = {i: entropy[LAST_MATCH] - entropy[i] for i in refers_to}  # small gains must not add up
+        assert max(since_match.values()) < GAIN_NATS, max(since_match, key=lambda i: since_match[i])

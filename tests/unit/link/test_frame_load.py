@@ -1,19 +1,25 @@
-"""Texts to the pilot about a computer that is too slow for the camera."""
+"""A computer that is too slow for the camera: text to the pilot, and the span that the verdict of the report names."""
 
 from link_rig import S, texts
 from terrafix.link.node import LinkNode
-from terrafix.messages import OVERTAKEN, Frame, Message
+from terrafix.messages import OVERTAKEN, CalibrationFault, Frame, Message
+from terrafix_tools.estimates import Row
+from terrafix_tools.flight_verdict import flight_verdict
 
 RATE = 2  # frames per second
 
 
-def texts_of(left_out: list[bool], error: str = OVERTAKEN) -> list[str]:
-    """Of a link that receives frames at RATE, each with ``error`` where it is left out."""
+def published_of(left_out: list[bool], error: str = OVERTAKEN) -> list[Message]:
+    """By a link that receives frames at RATE, each with ``error`` where it is left out."""
     node, published = LinkNode(10.0), list[Message]()
     for i, out in enumerate(left_out):
         frame = Frame(t_ns=i * S // RATE, frame_id=i, file="", width=640, height=480, error=error if out else "")
         published += node.on(frame)
-    return texts(published)
+    return published
+
+
+def texts_of(left_out: list[bool], error: str = OVERTAKEN) -> list[str]:
+    return texts(published_of(left_out, error))
 
 
 def test_a_computer_that_leaves_out_most_frames_is_reported_once_and_so_is_its_recovery() -> None:
@@ -22,6 +28,13 @@ def test_a_computer_that_leaves_out_most_frames_is_reported_once_and_so_is_its_r
         "Terrafix: computer too slow: 11 of 20 frames out",
         "Terrafix: computer keeps up again",
     ]
+
+
+def test_the_verdict_names_the_span_in_which_the_computer_was_too_slow() -> None:
+    left_out = [False] * 60 + [True] * 40 + [False] * 60
+    faults = [(x.t_ns / S, x) for x in published_of(left_out) if isinstance(x, CalibrationFault)]
+    ((from_s, to_s, which),) = flight_verdict([Row(file="", t_s=80.0)], faults).refused
+    assert from_s == 30.0 and 50.0 < to_s <= 55.0 and which == "computer too slow"
 
 
 def test_a_few_overtaken_frames_are_no_slow_computer() -> None:

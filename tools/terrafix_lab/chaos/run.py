@@ -125,7 +125,7 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> tuple[Outcome, 
         without_fix_s=judge.without_fix_s(times, fault_s, end_s),
         back_s=judge.back_s(times, ended_s, end_s),
         criteria=measured([track]),
-        texts=[f"{t_s - fault_s:.1f} s: {text}" for t_s, text in track.told],
+        texts=[f"{t_s - fault_s:.1f} s: {text}" for t_s, text in track.texts],
         fix_lost=judge.times_lost(times, fault_s, end_s),
         load=os.getloadavg()[0] / (os.cpu_count() or 1),
     )
@@ -134,8 +134,8 @@ def _fly(rig: Rig, fault: Fault, phase: Phase, lead_s: float) -> tuple[Outcome, 
 
 def _track(rig: Rig, span: Span, fault: Fault) -> Track:
     """So far. ``span``: of the fault."""
-    told = [(t_s, text) for t_s, text in rig.peer.texts() if t_s >= span.from_s]
-    return replace(judge.track_of(rig.peer.fixes(), span, rig.camera.pushed_s, fault.cause), told=told)
+    texts = [(t_s, text) for t_s, text in rig.peer.texts() if t_s >= span.from_s]
+    return replace(judge.track_of(rig.peer.fixes(), span, rig.camera.pushed_s, fault.cause), texts=texts)
 
 
 def _wait_for_first_fix(rig: Rig) -> None:

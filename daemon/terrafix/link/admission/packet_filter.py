@@ -19,7 +19,7 @@ from terrafix.link.admission.served_autopilot import (
 from terrafix.link.admission.telemetry_check import TelemetryCheck
 from terrafix.link.autopilot.checkpoint import LinkCheckpoint
 from terrafix.link.mavlink.transport import Address
-from terrafix.messages import MeasurementVerdict
+from terrafix.messages import CalibrationFault, MeasurementVerdict
 
 UNCLEAR_TEXT_NS = 30 * NS_PER_S  # between two texts that name the vehicles [spec: as of prior_request.py]
 
@@ -46,8 +46,9 @@ class Admission:
             self._rejections.add(RejectionReason.SENDER, f"system {served.sysid} at {sender[0]}:{sender[1]}", now_ns)
         return Role.INCONSISTENT if role is Role.AUTOPILOT and self._is_inconsistent(message, now_ns) else role
 
-    def verdicts(self, now_ns: int) -> Iterator[MeasurementVerdict]:
-        return self._rejections.verdicts(now_ns)
+    def rejections(self, now_ns: int) -> Iterator[MeasurementVerdict | CalibrationFault]:
+        yield from self._rejections.verdicts(now_ns)
+        yield from self._rejections.faults(now_ns)
 
     def pilot_texts(self, now_ns: int) -> Iterator[str]:
         """-> warnings that are new since the last call, at most 40 characters each."""
@@ -59,7 +60,6 @@ class Admission:
         if self._unclear_text_ns is None:
             for other in self.served.new_others(now_ns):
                 yield pilot_text(other, self.served.sysid)
-        yield from self._rejections.pilot_texts()
 
     def notes(self, now_ns: int) -> Iterator[str]:
         """-> texts for ``LinkStatus``; may be empty strings."""

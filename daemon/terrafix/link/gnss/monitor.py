@@ -68,7 +68,7 @@ class GnssMonitor:
         self._fallback = True  # the autopilot may use its receiver while we send no fix
         self._switched_ns: int | None = None
         self._ekf_status: EkfStatus | None = None
-        self._refused = False  # a switch to our position, since the pilot was told
+        self._refused = False  # a switch to our position, that was reported to the pilot
 
     def on_estimate(self, estimate: NavEstimate, inertial: InertialBuffer) -> None:
         if self._estimate is not None:

@@ -13,8 +13,8 @@ MIN_FRAMES, MIN_DURATION_NS = 3, 2 * NS_PER_S
 # m, 1-sigma. A position with a larger one is searched on the map, and only a search can use a hint. Equal to
 # SEARCH_START_SIGMA_M of core/initial_position.py, which imports more than this process may load. [tuned]
 UNKNOWN_POSITION_SIGMA_M = 100.0
-# Without a map fix: from the last degradation level and this share of the route so far on. [spec: requirement AC-6]
-UNANCHORED_SHARE, MIN_UNANCHORED_NS = 0.2, round(DEGRADATION_LEVELS[-1][0] * NS_PER_S)
+# Without a map fix: from the first degradation level and this share of the route so far on. [spec: requirement AC-6]
+UNANCHORED_SHARE, MIN_UNANCHORED_NS = 0.2, round(DEGRADATION_LEVELS[1][0] * NS_PER_S)
 # From this way in metres on whatever the share is. [spec: AC-2, 20 m, over a drift of 1 %]
 MAX_UNANCHORED_M = 2000.0
 AGE_STEP_NS = 1_000_000  # ns: the age of a fix is in whole milliseconds [spec: NavEstimate.last_anchor_age_ms]

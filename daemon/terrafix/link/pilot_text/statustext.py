@@ -3,6 +3,15 @@
 from terrafix.messages import CalibrationFault, StatusText
 
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY [spec: MAVLink MAV_SEVERITY]
+TOO_SLOW, TWO_SENDERS = "computer too slow", "telemetry of two senders"
+TIME_JUMPS, ATTITUDE_JUMPS = "autopilot rebooted, or its time jumps", "attitude jumps without gyros"
+# Faults of the link, which leave out frames or telemetry, by quantity: texts of their beginning and their end.
+LINK_FAULTS = {
+    TOO_SLOW: (f"{TOO_SLOW}: {{}}", "computer keeps up again"),
+    TWO_SENDERS: (f"{TWO_SENDERS}, one ignored", "telemetry of one sender again"),
+    TIME_JUMPS: (TIME_JUMPS, "the autopilot's time is steady again"),
+    ATTITUDE_JUMPS: (f"{ATTITUDE_JUMPS}, ignored", "the attitude is steady again"),
+}
 
 
 def statustext(t_ns: int, severity: int, text: str) -> StatusText:
@@ -11,6 +20,9 @@ def statustext(t_ns: int, severity: int, text: str) -> StatusText:
 
 def fault_text(fault: CalibrationFault) -> str:
     """Text of 40 characters at most about a fault that a monitor found or ended."""
+    if fault.quantity in LINK_FAULTS:
+        begins, ends = LINK_FAULTS[fault.quantity]
+        return begins.format(fault.detail) if fault.active else ends
     if fault.quantity == "registration":
         return "the map is found nowhere: no fix" if fault.active else "the map is found again"
     if fault.quantity == "start":

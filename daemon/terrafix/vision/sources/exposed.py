@@ -13,7 +13,7 @@ from terrafix.messages import STAMP_SIGMA_S, Exposure, Fact, Frame
 WINDOW = (
     60  # newest frames and reports that are compared: half a minute at 2 Hz [spec: MIN_EXPOSED_FRAMES and lost ones]
 )
-TOLD_FRAMES = 20  # after which it is told that nothing fits [spec: a third of WINDOW]
+REPORTED_FRAMES = 20  # after which it is reported that nothing fits [spec: a third of WINDOW]
 FOLDER_SIGMA_S = 1.0  # of the stamps in a table against the clock of its log [spec: EXIF has whole seconds]
 
 
@@ -41,7 +41,7 @@ class ReportedExposures:
         self._reports: dict[str, deque[int]] = {}
         self._stamps: deque[int] = deque(maxlen=WINDOW)
         self._newest_ns = -1  # time that the newest frame was given
-        self._told = ""
+        self._reported = ""
 
     def add(self, exposure: Exposure) -> None:
         of_kind = self._reports.setdefault(exposure.kind, deque(maxlen=WINDOW))
@@ -67,15 +67,15 @@ class ReportedExposures:
                 sigma_s = max(found.jitter_s, min(frame.stamp_sigma_s, STAMP_SIGMA_S))
                 return msgspec.structs.replace(frame, t_ns=t_ns, buffered=False, stamp_sigma_s=sigma_s)
             refused = refused or f"{kind}: {found}"
-        if len(self._stamps) >= TOLD_FRAMES:
+        if len(self._stamps) >= REPORTED_FRAMES:
             self._tell("none", refused or "their latency is longer than the time between two frames", fits=False)
         self._newest_ns = frame.t_ns
         return frame
 
     def _tell(self, state: str, text: str, *, fits: bool) -> None:
-        if state == self._told:
+        if state == self._reported:
             return
-        self._told = state
+        self._reported = state
         if fits:
             logs.get().info("exposures of the autopilot are used", which=text)
         else:

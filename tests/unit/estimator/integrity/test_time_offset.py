@@ -144,7 +144,7 @@ def test_an_offset_that_nothing_observes_is_claimed_once_its_buffer_may_have_fil
     assert mass.sum() == pytest.approx(1.0) and away[60] < 0.05 < away[299]
 
 
-def test_a_buffer_that_fills_is_told_claimed_and_corrected(plane: InertialFlight) -> None:
+def test_a_buffer_that_fills_is_reported_claimed_and_corrected(plane: InertialFlight) -> None:
     """A delay that grows from 0 to 2 s over 40 s of the flight."""
     run, beyond = EstimatorRun(), 0
     run.feed([INERTIAL_ORIGIN, Frame(t_ns=0, frame_id=0, file="", width=1, height=1, buffered=True)])

@@ -7,7 +7,7 @@ from terrafix.link.pilot_text.statustext import fault_text
 from terrafix.messages import CalibrationFault, Verdict
 
 
-def told(*verdicts: Verdict) -> list[CalibrationFault]:
+def faults_of(*verdicts: Verdict) -> list[CalibrationFault]:
     """Of frames half a second apart."""
     refused = RefusedPictures()
     return [fault for k, verdict in enumerate(verdicts) for fault in refused.add(k * 500_000_000, verdict)]
@@ -25,14 +25,14 @@ def test_a_run_of_refused_pictures_is_named_from_its_first_one_to_three_used_one
     verdicts: list[Verdict], quantity: str
 ) -> None:
     used = [Verdict.ACCEPTED]
-    began, ended = told(*used, *verdicts, *used * 3)
+    began, ended = faults_of(*used, *verdicts, *used * 3)
     assert (began.quantity, began.active, began.t_ns) == (quantity, True, 500_000_000)
     assert (ended.quantity, ended.active) == (quantity, False)
     assert fault_text(began) == f"{quantity}: not used" and len(f"Terrafix: {fault_text(began)}") <= 50
 
 
 def test_less_than_three_seconds_and_frames_without_an_image_are_not_named() -> None:
-    assert told(*[Verdict.STALLED] * 6, Verdict.ACCEPTED) == []
-    assert told(*[Verdict.OVERTAKEN] * 20, Verdict.STALLED, *[Verdict.OVERTAKEN] * 20) == []
-    began, *others = told(*[Verdict.STALLED] * 8, Verdict.ACCEPTED, Verdict.ACCEPTED, *[Verdict.STALLED] * 9)
+    assert faults_of(*[Verdict.STALLED] * 6, Verdict.ACCEPTED) == []
+    assert faults_of(*[Verdict.OVERTAKEN] * 20, Verdict.STALLED, *[Verdict.OVERTAKEN] * 20) == []
+    began, *others = faults_of(*[Verdict.STALLED] * 8, Verdict.ACCEPTED, Verdict.ACCEPTED, *[Verdict.STALLED] * 9)
     assert began.active and others == [], "two used ones are no end"

@@ -1,13 +1,10 @@
-"""Rejected telemetry: verdicts, texts to the pilot, notes in LinkStatus."""
-
-import pytest
+"""Rejected telemetry: verdicts, faults by their cause, notes in LinkStatus."""
 
 from link_rig import MS, S
 from terrafix import messages as m
 from terrafix.link.admission.refusals import (
     EPISODE_TIMEOUT_NS,
-    MIN_PILOT_TEXT_MESSAGES,
-    PILOT_TEXTS,
+    MIN_FAULT_MESSAGES,
     RejectionLog,
     RejectionReason,
 )
@@ -33,15 +30,28 @@ def test_a_rejection_verdict_has_measurement_telemetry_and_no_frame() -> None:
     assert verdict.verdict is m.Verdict.IMPLAUSIBLE
 
 
-def test_the_pilot_gets_one_text_per_episode_of_many_rejections() -> None:
+def test_an_episode_of_many_rejections_is_one_fault_from_the_first_to_the_last_of_them() -> None:
     rejections = RejectionLog()
-    texts = []
-    for i in range(3 * MIN_PILOT_TEXT_MESSAGES):
-        at_ns = S + i * MS + (EPISODE_TIMEOUT_NS if i >= 2 * MIN_PILOT_TEXT_MESSAGES else 0)
-        rejections.add(RejectionReason.ATTITUDE, "x", at_ns)
-        texts += [(i, text) for text in rejections.pilot_texts()]
-    text = PILOT_TEXTS[RejectionReason.ATTITUDE]
-    assert texts == [(MIN_PILOT_TEXT_MESSAGES - 1, text), (3 * MIN_PILOT_TEXT_MESSAGES - 1, text)]
+    faults = []
+    for i in range(30):  # the last ten begin another episode
+        at_ns = S + i * MS + (2 * EPISODE_TIMEOUT_NS if i >= 20 else 0)
+        faults += rejections.faults(at_ns)
+        rejections.add(RejectionReason.SEQUENCE, "x", at_ns)
+        faults += rejections.faults(at_ns)
+    last_ns = S + 19 * MS
+    assert [(f.quantity, f.t_ns, f.active) for f in faults] == [
+        ("telemetry of two senders", t_ns, active)
+        for t_ns, active in ((S, True), (last_ns, False), (S + 20 * MS + 2 * EPISODE_TIMEOUT_NS, True))
+    ]
+
+
+def test_a_few_rejections_are_no_fault_and_a_second_sender_is_named_elsewhere() -> None:
+    rejections = RejectionLog()
+    for i in range(2 * MIN_FAULT_MESSAGES):
+        rejections.add(RejectionReason.SENDER, "x", S)
+        if i < MIN_FAULT_MESSAGES - 1:
+            rejections.add(RejectionReason.SEQUENCE, "x", S)
+    assert list(rejections.faults(S)) == []
 
 
 def test_link_status_names_a_rejection_until_its_episode_ends() -> None:
@@ -49,8 +59,3 @@ def test_link_status_names_a_rejection_until_its_episode_ends() -> None:
     rejections.add(RejectionReason.BOOT_TIME, "steps", S)
     assert list(rejections.notes(S + EPISODE_TIMEOUT_NS - 1)) == ["telemetry refused, boot time: steps"]
     assert list(rejections.notes(S + EPISODE_TIMEOUT_NS)) == []
-
-
-@pytest.mark.parametrize("text", PILOT_TEXTS.values())
-def test_rejection_texts_fit_into_statustext(text: str) -> None:
-    assert len("Terrafix: " + text) <= 50

@@ -172,9 +172,9 @@ def test_the_switch_to_the_map_is_a_step_of_200_m_at_most(autopilot_m: float | N
 
     published += feed_receiver(node, 30.0, where)
     assert [x.vision for x in published if isinstance(x, m.PositionSource)] == [True] * switches
-    told = [x.text for x in published if isinstance(x, m.StatusText) and "not switched" in x.text]
+    texts = [x.text for x in published if isinstance(x, m.StatusText) and "not switched" in x.text]
     step_m = 300 if autopilot_m is None else autopilot_m
-    assert told == ([] if switches else [f"Terrafix: not switched: the map is {step_m:.0f} m off"])
+    assert texts == ([] if switches else [f"Terrafix: not switched: the map is {step_m:.0f} m off"])
 
 
 def test_there_is_no_switch_while_one_receiver_is_trusted() -> None:

@@ -213,7 +213,7 @@ def unanchored_request_s(anchored_s: int, *, speed_mps: float = 20.0, until_s: i
     return None, ""
 
 
-@pytest.mark.parametrize(("anchored_s", "after_s"), [(20, 35), (200, 50), (-1, 35), (1000, None)])
+@pytest.mark.parametrize(("anchored_s", "after_s"), [(12, 5), (36, 9), (200, 50), (-1, 5), (1000, None)])
 def test_a_hint_is_requested_after_a_fifth_of_the_route_without_a_map_fix(anchored_s: int, after_s: int | None) -> None:
     asked_s, text = unanchored_request_s(anchored_s)
     assert asked_s == after_s

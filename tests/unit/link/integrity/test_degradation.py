@@ -12,6 +12,7 @@ from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
 from terrafix.link.node import LinkNode
 from terrafix.link.pilot_text.debounce import MAX_TEXT_INTERVAL_NS, RESET_AFTER_NS, Debounce
+from terrafix.link.pilot_text.statustext import LINK_FAULTS
 
 MAX_CHARACTERS = 50  # characters of STATUSTEXT
 KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
@@ -25,6 +26,9 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"estimator (died|stuck|gave up)",
     r"computer is (normal|hot|critical)(, -?\d+ C)?",
     r"computer (too slow: \d+ of \d+ frames out|keeps up again)",
+    r"telemetry of (two senders, one ignored|one sender again)",
+    r"(autopilot rebooted, or its time jumps|the autopilot's time is steady again)",
+    r"(attitude jumps without gyros, ignored|the attitude is steady again)",
     r"GPS \d is \d+ m off the map",
     r"GPS \d and the map disagree",
     r"GPS \d is lost",
@@ -199,3 +203,13 @@ def test_a_picture_that_turns_in_flight_is_reported_to_the_pilot_as_not_used(
     began, ended = (message for message in published if isinstance(message, m.StatusText))
     assert is_known(began.text) and quantity in began.text and began.text.endswith("not used") and began.severity == 2
     assert ended.text == "Terrafix: the picture is right again" and ended.severity == 6
+
+
+@pytest.mark.parametrize("quantity", LINK_FAULTS)
+def test_telemetry_and_frames_that_are_left_out_are_a_warning_by_their_cause(quantity: str) -> None:
+    node = LinkNode(10.0)
+    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail="11 of 20 frames out", active=True)
+    published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
+    began, ended = (message for message in published if isinstance(message, m.StatusText))
+    assert is_known(began.text) and quantity in began.text and began.severity == 4
+    assert is_known(ended.text) and ended.severity == 6

@@ -23,7 +23,7 @@ NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
 MIN_PATH_M = 100.0  # a relative drift over a shorter path has no meaning
 UNKNOWN_M, REQUEST_FRAMES, REQUEST_S = 100.0, 3, 2.0  # AC-6: 1-sigma of an unknown position, for so long
 # AC-6: time without a map fix, and the share of the route so far, or the way, that was flown in it
-NO_FIX_S, NO_FIX_SHARE, NO_FIX_M = 35.0, 0.2, 2000.0
+NO_FIX_S, NO_FIX_SHARE, NO_FIX_M = 5.0, 0.2, 2000.0
 ROUNDING_M = 0.1  # of a way at its limit
 BEGIN_FRAMES = 6  # PB-5: five frames are tried with the same local map before a new fragment starts
 SETTLE_S = 10.0  # after a marked span, until frames count as outside of it
@@ -299,7 +299,7 @@ def _unknown(estimates: Sequence[NavEstimate]) -> list[bool]:
 
 
 def _far_without_fix(estimates: Sequence[NavEstimate]) -> list[bool]:
-    """For each estimate, whether a fifth of the way so far, or 2 km, was flown without a map fix, for 35 s or more.
+    """For each estimate, whether a fifth of the way so far, or 2 km, was flown without a map fix, for 5 s or more.
 
     Before the first map fix the first estimate counts as one."""
     if not estimates:
