@@ -16,9 +16,7 @@ INNOVATIONS_PER_HOUR = 36_000.0  # [spec: ten frames a second]
 # A false alarm costs the fix until the next map match, a missed one is a wrong position.
 INNOVATION_FALSE_ALARM_HOURS = 3.0  # [spec: one in some flights]
 INDEPENDENT_RUNS = 7.0  # of those that end with an innovation [measured: docs/decisions/059]
-RUN_SIZE = (
-    20  # innovations of the longest run that is tested: two seconds of a fast camera, twenty of a slow one [tuned]
-)
+RUN_SIZE = 20  # innovations of the longest run [spec: two seconds at ten frames a second]
 MIN_RUN = 2  # innovations: one is an outlier [spec: no run]
 MAX_SIGMAS = math.sqrt(GATE[3])  # of an innovation that counts; a larger one is an outlier as well [spec: core/gate.py]
 
