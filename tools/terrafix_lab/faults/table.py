@@ -153,7 +153,7 @@ FALSE_INPUTS = (
         "picture squeezed in one axis",
         "16:9 is shown as 4:3 in every picture: one axis has another scale than the description says.",
         source=shown(pictures.scaled(1.0, 4.0 / 3.0)),
-        cause="squeezed",
+        cause="squeezed|contradicts motion",
     ),
     Fault(
         "camera upside down",

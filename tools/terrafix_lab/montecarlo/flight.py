@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -66,6 +66,11 @@ class Record:
     smoothed_cov: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))  # (N, 2, 2) as published
     lie: Span | None = None  # of the first false input; None: there is none
     fixes: dict[str, int] = field(default_factory=dict)  # verdicts on map matches
+
+    def of_frames(self, estimated: np.ndarray) -> "Record":
+        """The record without frames that have no estimate: images that were taken before the newest one."""
+        by_frame = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        return replace(self, **{name: value[estimated] for name, value in by_frame.items()})
 
 
 def run(plan: FlightPlan, *, refine: bool = True) -> Record:
@@ -172,7 +177,7 @@ class Run:
         record.smoother_cpu_s = self._smoother.cpu_s
         estimator = self._node.estimator  # no message has this number
         record.rebuilds = estimator.graph.rebuilds if estimator is not None else 0
-        return record
+        return record.of_frames(np.isfinite(record.error_m[:, 0]))
 
     def _record_message(self, publisher: str, message: Message) -> None:
         record = self._record

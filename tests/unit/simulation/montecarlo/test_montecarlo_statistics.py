@@ -122,6 +122,9 @@ def test_a_restarted_estimator_processes_the_same_messages_and_agrees() -> None:
     alone = run(drawn, refine=False)
     record = Run(drawn, estimators).record(refine=False)
     np.testing.assert_array_equal(record.error_m, alone.error_m)  # the output of the old one is unchanged
+    estimated = np.arange(len(alone.t_s)) != 3  # a frame that was left out has no estimate
+    assert alone.of_frames(estimated).t_s.tolist() == np.delete(alone.t_s, 3).tolist()
+    assert len(alone.of_frames(estimated).cov) == len(alone.cov) - 1
     spent_ms = np.array(estimators.frames_ms)
     assert len(spent_ms) == (record.t_s > 30.0).sum() and (spent_ms > 0.0).all()
     old, young = estimators.estimator, estimators.young.estimator  # type: ignore[union-attr]
