@@ -220,15 +220,15 @@ class Propagation:
         these; without such readings velocity is unknown."""
         innovation, cov = predicted.odometry.motion_innovation, predicted.cov.copy()
         assert innovation is not None
-        signed, self._signed = self._signed, SignedInnovations()
-        off_m = signed.sum_m
+        off_m = self._signed.sum_m
         cov[HORIZONTAL, HORIZONTAL] += np.outer(off_m, off_m)
         if innovation.inertial:
-            off_mps = signed.largest_m / innovation.dt_s
+            off_mps = self._signed.largest_m / innovation.dt_s
             cov[DELTA_V, DELTA_V][HORIZONTAL, HORIZONTAL] += np.outer(off_mps, off_mps)
             self._state.images_contradicted = True
         else:
             cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
+        self._signed.forget()
         detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
         reset = _reset_verdict(ResetReason.VELOCITY, detail)
         confirmed = not innovation.inertial
@@ -440,7 +440,8 @@ class Propagation:
         innovation = odometry.motion_innovation
         if odometry.fused is None or innovation is None or odometry.begins_disconnected:
             return False
-        self._signed.add(innovation.residual_m[HORIZONTAL], innovation.cov_m2[HORIZONTAL, HORIZONTAL])
+        cov_m2 = innovation.cov_m2[HORIZONTAL, HORIZONTAL]
+        self._signed.add(innovation.residual_m[HORIZONTAL], cov_m2, inertial=innovation.inertial)
         return self._signed.alarm
 
     def _note_refused_motion(self, odometry: GatedOdometry, t_s: float) -> None:
