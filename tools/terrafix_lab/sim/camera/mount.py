@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -29,15 +28,6 @@ class CameraMotion:
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         angle = (speed_radps * after_s)[:, None, None]  # Rodrigues' formula
         return positions, r_w_c @ (np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross))
-
-
-class CameraMount(Protocol):
-    """Mount of a camera: pose and motion from the state of the vehicle. The camera is at the vehicle's position."""
-
-    def r_w_c(self, state: State) -> np.ndarray:
-        """R_w_c (3, 3)."""
-
-    def motion(self, state: State) -> CameraMotion: ...
 
 
 @dataclass(frozen=True)
