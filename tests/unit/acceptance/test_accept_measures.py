@@ -162,8 +162,15 @@ def test_relocalization_requires_five_consecutive_frames(tmp_path: Path) -> None
     marks = Marks(spans=(Span(1.0, 3.0, "blind"),))
     frames = [GOOD] * 2 + [LOST] * 6 + [GOOD] + [LOST] * 3 + [GOOD] * 8  # one good frame at 4 s, all from 6 s on
     assert of.relocalized_after_s(evidence(tmp_path, frames, marks)).value == pytest.approx(3.0)
-    never = of.relocalized_after_s(evidence(tmp_path / "never", [GOOD] * 2 + [LOST] * 10, marks))
-    assert never.value is None and never.verdict is Verdict.BELOW
+
+
+@pytest.mark.parametrize(("seconds_after", "verdict"), [(29, None), (31, Verdict.BELOW)])
+def test_a_flight_that_ends_before_the_floor_of_the_relocalization_decides_nothing(
+    tmp_path: Path, seconds_after: int, verdict: Verdict | None
+) -> None:
+    frames = [GOOD] * 2 + [LOST] * (2 * seconds_after + 5)  # two a second, the last one so long after the span
+    found = of.relocalized_after_s(evidence(tmp_path, frames, Marks(spans=(Span(1.0, 3.0, "blind"),))))
+    assert found.value is None and found.verdict is verdict
 
 
 def test_frames_in_a_marked_span_do_not_count_as_outside(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import msgspec
 
 from terrafix_lab.accept.fly import Result
 from terrafix_lab.accept.measuring.criteria import CRITERIA
-from terrafix_lab.accept.measuring.results import BROKEN, JudgedRow, Verdict, with_unit
+from terrafix_lab.accept.measuring.results import JudgedRow, Verdict, with_unit
 from terrafix_lab.accept.run import AcceptOptions
 from terrafix_lab.accept.table import Acceptance
 
@@ -63,7 +63,7 @@ def _line(place: str, result: Result) -> CaseLine:
         recovery_frames=value("recovery"),
         never_recovered=recovery is not None and recovery.measured is None and recovery.verdict is Verdict.BELOW,
         claim_width=value("claim width"),
-        broken=sum(row.verdict in BROKEN for row in result.rows),
+        broken=sum(row.verdict is Verdict.BELOW for row in result.rows),
         why="" if result.frames else result.rows[0].why,
     )
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 
 from terrafix_lab.accept.fly import Result
-from terrafix_lab.accept.measuring.results import BROKEN, JudgedRow, Verdict, with_unit
+from terrafix_lab.accept.measuring.results import BELOW_FLOOR, JudgedRow, Verdict, with_unit
 from terrafix_lab.accept.table import NAME, Acceptance, markdown
 from terrafix_tools.pages.charts import Chart, spans_of
 from terrafix_tools.pages.document import Figure, kit, macros, write_file
@@ -22,7 +22,7 @@ KEYS += [("k-dead", "dead reckoning"), ("k-none", "no position")]
 MARKS = {
     Verdict.PASS: ("good", "holds"),
     Verdict.BELOW: ("bad", "below floor"),
-    Verdict.NOT_BUILT: ("bad", "not built"),
+    Verdict.KNOWN: ("bad", "known shortfall"),
     Verdict.NOT_MEASURABLE: ("none", "–"),
 }
 
@@ -50,7 +50,7 @@ def _head(acceptance: Acceptance) -> str:
         Figure(str(sum(bool(r.points) for r in acceptance.results)), "", "scenarios flown"),
         Figure(str(counts[Verdict.PASS]), "", "rows hold their floor", "good"),
         Figure(str(counts[Verdict.BELOW]), "", "rows below their floor", "bad" if counts[Verdict.BELOW] else ""),
-        Figure(str(counts[Verdict.NOT_BUILT]), "", "rows not built", "bad" if counts[Verdict.NOT_BUILT] else ""),
+        Figure(str(counts[Verdict.KNOWN]), "", "rows below it for a known reason"),
         Figure(str(counts[Verdict.NOT_MEASURABLE]), "", "rows not measurable here"),
     ]
     machine = acceptance.machine
@@ -66,7 +66,7 @@ def _head(acceptance: Acceptance) -> str:
 
 
 def _broken(acceptance: Acceptance) -> str:
-    rows = [row for row in acceptance.rows if row.verdict in BROKEN]
+    rows = [row for row in acceptance.rows if row.verdict in BELOW_FLOOR]
     if not rows:
         return kit.section("Every floor that was measured holds", "")
     scenarios = [
@@ -101,7 +101,7 @@ def _cell(rows: list[JudgedRow]) -> tuple[str, str, str] | None:
     """CSS class, tip, text."""
     if not rows:
         return None
-    order = (Verdict.BELOW, Verdict.NOT_BUILT, Verdict.PASS, Verdict.NOT_MEASURABLE)
+    order = (Verdict.BELOW, Verdict.KNOWN, Verdict.PASS, Verdict.NOT_MEASURABLE)
     worst = min(rows, key=lambda row: order.index(row.verdict))
     tip = "\n".join(
         f"{r.what}: {with_unit(r.measured, r.unit)}, {r.verdict}{'; ' + r.why if r.why else ''}" for r in rows
@@ -137,8 +137,8 @@ def _picture(result: Result) -> tuple[str, str, str, str, str]:
     labels = spans_of([(p.t_s - zero_s, p.label) for p in result.points], end_s - zero_s)
     for low, high, label in labels:
         chart.bottom_strip(low, high, f"f-{label or 'none'}", WORDS.get(label, "no position"), STRIP)
-    broken = sum(row.verdict in BROKEN for row in result.rows)
-    css, words = ("bad", f"{broken} below floor or not built") if broken else ("good", "holds")
+    broken = sum(row.verdict in BELOW_FLOOR for row in result.rows)
+    css, words = ("bad", f"{broken} below floor") if broken else ("good", "holds")
     return result.scenario, css, words, result.promise, chart.svg(f"Error and claim: {result.scenario}")
 
 

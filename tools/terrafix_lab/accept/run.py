@@ -18,7 +18,7 @@ from terrafix_lab.accept import fly
 from terrafix_lab.accept.false_inputs.scenarios import LIES, LIES_IN_THE_LOOP
 from terrafix_lab.accept.fly import RESULT, Job, Result
 from terrafix_lab.accept.measuring.criteria import failed, unmeasured
-from terrafix_lab.accept.measuring.results import BROKEN, with_unit
+from terrafix_lab.accept.measuring.results import BELOW_FLOOR, with_unit
 from terrafix_lab.accept.page import write
 from terrafix_lab.accept.plan import CLOSED_LOOP, Scenario
 from terrafix_lab.accept.scenarios import BY_NAME, COMMAND, SCENARIOS
@@ -82,8 +82,10 @@ def accept(options: AcceptOptions) -> Acceptance:
         task = progress.add_task("scenarios", total=len(chosen), completed=len(results))
         for result in _fly_all(jobs, options.workers, progress, task):
             results[result.scenario] = result
-            write(_concluded(options, chosen, results), options.out)
-            progress.console.print(_line(result), highlight=False)
+            acceptance = _concluded(options, chosen, results)
+            write(acceptance, options.out)
+            shown = next(r for r in acceptance.results if r.scenario == result.scenario)
+            progress.console.print(_line(shown), highlight=False)
             progress.advance(task)
     acceptance = _concluded(options, chosen, results)
     write(acceptance, options.out)
@@ -103,7 +105,7 @@ def _concluded(options: AcceptOptions, chosen: list[Scenario], results: dict[str
 
 def _line(result: Result) -> str:
     """Line on the console for a finished scenario."""
-    broken = [row for row in result.rows if row.verdict in BROKEN]
+    broken = [row for row in result.rows if row.verdict in BELOW_FLOOR]
     if not result.points:
         return f"  {result.scenario}: not flown, {result.rows[0].why}"
     words = "; ".join(f"{row.ac} {row.what}: {with_unit(row.measured, row.unit)} ({row.verdict})" for row in broken)

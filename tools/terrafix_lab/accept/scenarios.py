@@ -29,6 +29,7 @@ UNMATCHABLE, UNMATCHABLE_WITHIN = 0.20, (0.10, 0.90)  # shares of the frames: a 
 UNMATCHABLE_STEP = 0.05
 HOT = (1 / 3, 2 / 3)
 LONG_FRAMES = 1500
+WATER_FRAMES = 250  # the shortest flight that lasts for 30 s, the floor of AC-15, after the lake
 KIDNAPPED_M = np.array([700.0, 700.0])  # east, north, or the opposite: 990 m, with a stated sigma of tens of metres
 
 
@@ -224,7 +225,7 @@ SCENARIOS: tuple[Scenario, ...] = (
     Scenario("low texture", "Ground of an eighth of the contrast.", EVERYWHERE, without_fault, ground="low texture"),
     Scenario(
         "water", "A third of the route over open water: no map fix there, and no false one.",
-        WITH_SPAN, _over_water, ground="water"),
+        WITH_SPAN, _over_water, ground="water", frames=WATER_FRAMES),
     Scenario("hill country", "Relief of some 300 m, a kilometre wide.", EVERYWHERE, without_fault, ground="hills"),
     *(scenario_of(fault, EVERYWHERE, FRAMES) for fault in IMPRECISE_INPUTS),
     Scenario(

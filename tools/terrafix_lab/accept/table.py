@@ -7,8 +7,9 @@ import msgspec
 
 from terrafix.core.gate import CHI2_95
 from terrafix_lab.accept.fly import Result
+from terrafix_lab.accept.known_shortfalls import KNOWN_SHORTFALLS, explained, holding_again
 from terrafix_lab.accept.measuring.consistency import COVERAGE, RUN_CONFIDENCE, judge_claims
-from terrafix_lab.accept.measuring.results import BROKEN, Bounds, JudgedRow, Verdict, with_unit
+from terrafix_lab.accept.measuring.results import Bounds, JudgedRow, Verdict, with_unit
 from terrafix_tools.timing import machine
 
 NAME = "acceptance"
@@ -25,8 +26,9 @@ class Acceptance(msgspec.Struct, frozen=True, kw_only=True):
     quick: bool
     seed: int | None
     machine: dict[str, Any]
-    broken: int  # rows below their floor, or not built
+    broken: int  # rows below their floor that are no known shortfall
     rows: list[JudgedRow]
+    hold_again: list[str]  # known shortfalls whose floor holds in this run
     results: list[Result]
 
 
@@ -37,15 +39,20 @@ def conclude(
     ``whole``: all scenarios were selected; adds the rows that belong to no scenario."""
     overall = [_coverage_row(results, one_map=seed is None), _width_row(results)]
     overall += _not_replayable() if whole else []
-    rows = [row for result in results for row in result.rows] + overall
+    known = {} if seed is None else KNOWN_SHORTFALLS
+    results = [
+        msgspec.structs.replace(result, rows=[explained(row, known) for row in result.rows]) for result in results
+    ]
+    rows = [row for result in results for row in result.rows] + [explained(row, known) for row in overall]
     return Acceptance(
         flight=flight,
         map=map_path,
         quick=quick,
         seed=seed,
         machine=machine(),
-        broken=sum(row.verdict in BROKEN for row in rows),
+        broken=sum(row.verdict is Verdict.BELOW for row in rows),
         rows=rows,
+        hold_again=holding_again(rows, known),
         results=results,
     )
 
@@ -117,7 +124,7 @@ def markdown(acceptance: Acceptance) -> str:
     ]
     for row in acceptance.rows:
         verdict = row.verdict + (", goal met" if row.goal_met else "")
-        verdict = f"**{verdict}**" if row.verdict in BROKEN else verdict
+        verdict = f"**{verdict}**" if row.verdict is Verdict.BELOW else verdict
         cells = (
             row.scenario,
             row.ac,
@@ -133,8 +140,10 @@ def markdown(acceptance: Acceptance) -> str:
 
 
 def headline(acceptance: Acceptance) -> str:
-    """One line: number of rows by verdict."""
+    """One line: number of rows by verdict, and the known shortfalls that hold again."""
     counts = {verdict: sum(row.verdict is verdict for row in acceptance.rows) for verdict in Verdict}
     flown = sum(bool(result.points) for result in acceptance.results)
     words = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
-    return f"{flown} scenarios flown: {words}."
+    again = "; ".join(acceptance.hold_again)
+    again = f" Known shortfalls that hold again (see accept/known_shortfalls.py): {again}." if again else ""
+    return f"{flown} scenarios flown: {words}.{again}"

@@ -22,22 +22,13 @@ def montecarlo(
         typer.Option(help="Probability of each false input in a flight, in addition to its fault; 0.05 is usual."),
     ] = 0.0,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one for each processor.")] = None,
-    long: Annotated[
-        bool,
-        typer.Option(
-            "--endurance", help="Instead one flight of two hours: test that processor time and memory do not grow."
-        ),
-    ] = False,
 ) -> None:
     """Many simulated flights, as messages, through the real estimator: tests its accuracy and consistency.
 
     Exit code 0: all floors hold, or the flights are too few to judge one; 1: one does not hold."""
-    from terrafix_lab.montecarlo.endurance import endurance
     from terrafix_lab.montecarlo.run import RunOptions, fault_of
     from terrafix_lab.montecarlo.run import montecarlo as run
 
-    if long:
-        raise typer.Exit(0 if endurance(seed)["flat"] else BROKEN_FLOOR)
     options = RunOptions(out, flights, first, seed, duration, fault and fault_of(fault), lies, workers)
     result = run(options)
     typer.echo(f"Written to {out}")

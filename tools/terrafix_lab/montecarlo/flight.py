@@ -1,11 +1,9 @@
 """One flight of the run: messages into the real estimator and smoother."""
 
-import os
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -57,7 +55,6 @@ class Record:
     refined_error_m: np.ndarray  # (N, 2); nan: not refined
     refined_sigma_m: np.ndarray  # (N, 2)
     cpu_ms: np.ndarray  # (N,) of the estimator
-    memory_mb: np.ndarray  # (N,) of this process
     refine_cpu_s: float = 0.0
     rebuilds: int = 0
     restarts: int = 0
@@ -109,7 +106,6 @@ class Run:
         self._predictions: list[Prediction] = []  # since the last odometry
         self._frame = LocalFrame(flown.origin.lat_deg, flown.origin.lon_deg)
         self._times_ns: dict[int, int] = {}  # frame -> time of its newest estimate
-        self._page_mb = os.sysconf("SC_PAGE_SIZE") / 2**20
         n = len(flown.frames)
         self._record = Record(
             plan=plan,
@@ -124,7 +120,6 @@ class Run:
             refined_error_m=np.full((n, 2), np.nan),
             refined_sigma_m=np.full((n, 2), np.nan),
             cpu_ms=np.zeros(n),
-            memory_mb=np.full(n, np.nan),
             smoothed_error_m=np.full((n, 2), np.nan),
             smoothed_cov=np.full((n, 2, 2), np.nan),
         )
@@ -169,7 +164,6 @@ class Run:
                     self._shell.feed(match)
             record.cpu_ms[i] = 1e3 * (self._estimator.cpu_s - began_s)
             late = [(due, match) for due, match in late if due > i]
-            record.memory_mb[i] = self._page_mb * int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         if refine:
             began_s = self._estimator.cpu_s
             self._shell.feed(SourceEnded(t_ns=round(flown.frames[-1].t_s * 1e9), frames=len(flown.frames)))

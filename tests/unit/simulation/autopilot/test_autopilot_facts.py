@@ -35,48 +35,29 @@ def on_ground(kind: Kind, **parameters: float) -> Rig:
     return Rig(kind, flying=False, parameters={"EK3_GPS_CHECK": 31.0, "EK3_CHECK_SCALE": 100.0, **parameters})
 
 
-@pytest.mark.parametrize(("kind", "uses_s", "arms_s"), [(Kind.COPTER, 20.6, 21.7), (Kind.PLANE, 11.4, 12.4)])
+@pytest.mark.parametrize(("kind", "uses_s"), [(Kind.COPTER, 20.6), (Kind.PLANE, 11.4)])
 @pytest.mark.parametrize("rate_hz", [5.0, 10.0])
-def test_fact_a_good_gps_is_used_and_allows_arming_in_time(
-    kind: Kind, uses_s: float, arms_s: float, rate_hz: float
-) -> None:
+def test_fact_a_good_gps_is_used_in_time(kind: Kind, uses_s: float, rate_hz: float) -> None:
     rig = on_ground(kind)
     gps = changed(rate_hz=rate_hz, satellites=6, hdop=2.5, hacc=5.0, vacc=7.5, sacc=1.0)
     assert rig.fly(40.0, gps, until=lambda: "EKF3 IMU0 origin set" in rig.texts()) == pytest.approx(10.0, abs=0.5)
     rig.fly(40.0, gps, until=lambda: "EKF3 IMU0 is using GPS" in rig.texts())
     assert rig.t_s == pytest.approx(uses_s, abs=0.5)
-    rig.fly(40.0, gps, until=lambda: not rig.autopilot.prearm(rig.t_s))
-    assert rig.t_s == pytest.approx(arms_s, abs=0.5)
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 2.0, 3.0, 4.0])
 def test_fact_below_5_hz_gps_is_used_and_never_healthy(rate_hz: float) -> None:
     rig = on_ground(Kind.COPTER)
-    rig.fly(60.0, changed(rate_hz=rate_hz))
+    rig.fly(40.0, changed(rate_hz=rate_hz))
     assert rig.flags() & ABSOLUTE
-    assert rig.autopilot.prearm(rig.t_s) == ["GPS 1: not healthy"]
-
-
-@pytest.mark.parametrize("fix_type", [1, 2])
-def test_fact_without_a_3d_fix_arming_reports_a_bad_fix(fix_type: int) -> None:
-    rig = on_ground(Kind.COPTER)
-    rig.fly(30.0, changed(fix_type=fix_type))
-    assert "GPS 1: Bad fix" in rig.autopilot.prearm(rig.t_s)
-    assert not rig.flags() & ABSOLUTE
-    assert "PreArm: GPS 1: Bad fix" in rig.texts()
-
-
-def test_fact_fix_type_0_keeps_a_copters_filter_from_starting() -> None:
-    rig = on_ground(Kind.COPTER)
-    rig.fly(30.0, changed(fix_type=0))
-    assert "EKF attitude is bad" in rig.autopilot.prearm(rig.t_s)
+    assert rig.autopilot.gps[0] is not None and not rig.autopilot.gps[0].healthy(rig.t_s)
 
 
 @BOTH
-def test_fact_no_gps_input_is_a_bad_fix(kind: Kind) -> None:
+@pytest.mark.parametrize("gps", [None, changed(fix_type=0), changed(fix_type=1), changed(fix_type=2)])
+def test_fact_without_a_3d_fix_the_filter_does_not_start(kind: Kind, gps: Gps | None) -> None:
     rig = on_ground(kind)
-    rig.fly(5.0)
-    assert "GPS 1: Bad fix" in rig.autopilot.prearm(rig.t_s)
+    rig.fly(25.0, gps)
     assert rig.flags() == 1024  # EKF_UNINITIALIZED
 
 
@@ -95,8 +76,7 @@ def test_fact_no_gps_input_is_a_bad_fix(kind: Kind) -> None:
 )
 def test_fact_a_fix_that_fails_the_checks_never_sets_the_origin(bad: Gps) -> None:
     rig = on_ground(Kind.COPTER)
-    rig.fly(60.0, bad)
-    assert rig.autopilot.prearm(rig.t_s) == ["AHRS: waiting for home"]
+    rig.fly(30.0, bad)
     assert rig.autopilot.navigation() is None
 
 
@@ -129,10 +109,10 @@ def test_fact_check_and_scale_determine_the_required_accuracy(
         | mavlink.GPS_INPUT_IGNORE_FLAG_VERTICAL_ACCURACY,
     ],
 )
-def test_fact_ignored_fields_do_not_prevent_arming(ignored: int) -> None:
+def test_fact_ignored_fields_do_not_prevent_use(ignored: int) -> None:
     rig = on_ground(Kind.COPTER)
     rig.fly(30.0, changed(ignore=ignored))
-    assert rig.autopilot.prearm(rig.t_s) == []
+    assert rig.flags() & ABSOLUTE
 
 
 def test_fact_the_default_parameters_require_a_better_accuracy_in_a_copter_than_in_a_plane() -> None:
@@ -427,17 +407,6 @@ def test_fact_more_satellites_are_preferred_in_mode_1_and_not_in_mode_4() -> Non
         assert rig.autopilot.used_gps == chosen
 
 
-def test_fact_every_enabled_gps_must_have_a_fix_before_arming() -> None:
-    parameters = {**BESIDE_A_RECEIVER, "GPS1_TYPE": 1.0, "ARMING_CHECK": 1.0}
-    rig = Rig(Kind.COPTER, flying=False, parameters=parameters, real_gps=at_5_hz(lambda _: real_fix()))
-    rig.fly(30.0)
-    assert rig.autopilot.prearm(rig.t_s) == ["GPS 2: Bad fix"]
-    rig.fly(30.0, changed(gps_id=1, north_m=80.0))
-    assert rig.autopilot.prearm(rig.t_s) == ["GPS positions differ by 80m"]
-    rig.autopilot.parameters["ARMING_CHECK"] = 1048566.0
-    assert rig.autopilot.prearm(rig.t_s) == []
-
-
 def test_fact_a_spoofed_gps_1_is_left_on_a_parameter_change() -> None:
     lat, lon = offset(LAT, LON, 0.0, 300.0)
     rig = Rig(
@@ -472,7 +441,7 @@ def test_fact_another_gps_id_is_ignored() -> None:
     rig = Rig(Kind.COPTER, flying=False)
     rig.fly(5.0, changed(gps_id=1))
     assert rig.autopilot.counts.other_instance == rig.autopilot.counts.received > 0
-    assert "GPS 1: Bad fix" in rig.autopilot.prearm(rig.t_s)
+    assert not rig.flags() & ABSOLUTE
 
 
 # --- source sets and external positions ---

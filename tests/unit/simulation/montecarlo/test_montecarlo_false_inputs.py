@@ -166,7 +166,7 @@ def judged(lie_from_s: float | None, false_at: list[int]) -> FlightResult:
         plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n),
         truth_m=np.zeros((n, 2)), error_m=error, cov=cov, velocity_error_mps=np.zeros((n, 3)),
         velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1), refined_error_m=np.zeros((n, 2)),
-        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n), memory_mb=np.zeros(n),
+        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n),
         lie=None if lie_from_s is None else Span(lie_from_s, math.inf, ""))  # fmt: skip
     return FlightResult.of(record)
 

@@ -216,6 +216,8 @@ def test_a_flight_is_reproducible_and_close_to_the_truth() -> None:
     for name in ("error_m", "cov", "velocity_error_mps", "refined_error_m"):
         assert np.array_equal(getattr(one, name), getattr(two, name), equal_nan=True)
     assert len(one.error_m) == SHORT_S
+    without = one.of_frames(np.arange(len(one.t_s)) != 3)  # an image that was left out has no estimate
+    assert without.t_s.tolist() == np.delete(one.t_s, 3).tolist() and len(without.smoothed_cov) == SHORT_S - 1
     assert np.median(np.hypot(*(one.error_m[:, :2] - np.array(drawn.map_offset_m)).T)) < 8.0
 
 

@@ -5,10 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafix_lab.montecarlo.endurance import RestartComparison, slopes
-from terrafix_lab.montecarlo.fault import DrawnFault
-from terrafix_lab.montecarlo.flight import Run, run
-from terrafix_lab.montecarlo.plan import plan
 from terrafix_lab.montecarlo.statistics import band, draws_in, floors, whitened
 from terrafix_tools.score import nees_band, nees_of
 
@@ -98,35 +94,3 @@ def test_flights_without_refined_positions_are_too_few_to_judge_them() -> None:
 
 def test_the_floor_of_false_fixes_says_what_no_case_in_so_many_flights_means() -> None:
     assert any("none in 100 flights: in less than 3.0% of all" in floor for floor in floors(totals()))
-
-
-@pytest.mark.parametrize(
-    ("growth_per_h", "growth_mb_per_h", "flat"), [(0.0, 0.5, True), (0.03, 0.0, False), (0.0, 60.0, False)]
-)
-def test_slopes_are_independent_of_the_load_of_the_machine(
-    growth_per_h: float, growth_mb_per_h: float, flat: bool
-) -> None:
-    rng, t_s = np.random.default_rng(5), np.arange(7200.0)
-    busy = np.where(rng.uniform(size=1200) < 0.05, 30.0, 0.0) + 5.0 * np.linspace(1.0, 2.0, 1200)
-    compared_ms = np.column_stack([(1.0 + 1.5 * growth_per_h) * busy, busy]) * (1.0 + 0.05 * rng.normal(size=(1200, 2)))
-    found = slopes(t_s, 200.0 + growth_mb_per_h * t_s / 3600.0, compared_ms, 1.5)
-    assert found["cpu_share_per_h"] == pytest.approx(growth_per_h, abs=3.0 * found["cpu_share_sigma"])
-    assert found["cpu_share_sigma"] < 0.005
-    assert found["memory_mb_per_h"] == pytest.approx(growth_mb_per_h)
-    assert found["flat"] is flat
-
-
-@pytest.mark.slow
-def test_a_restarted_estimator_processes_the_same_messages_and_agrees() -> None:
-    drawn, estimators = plan(1, 0, fault=DrawnFault.NONE, duration_s=60.0), RestartComparison(30.0)
-    alone = run(drawn, refine=False)
-    record = Run(drawn, estimators).record(refine=False)
-    np.testing.assert_array_equal(record.error_m, alone.error_m)  # the output of the old one is unchanged
-    estimated = np.arange(len(alone.t_s)) != 3  # a frame that was left out has no estimate
-    assert alone.of_frames(estimated).t_s.tolist() == np.delete(alone.t_s, 3).tolist()
-    assert len(alone.of_frames(estimated).cov) == len(alone.cov) - 1
-    spent_ms = np.array(estimators.frames_ms)
-    assert len(spent_ms) == (record.t_s > 30.0).sum() and (spent_ms > 0.0).all()
-    old, young = estimators.estimator, estimators.young.estimator  # type: ignore[union-attr]
-    apart_m = old.last.pose.translation() - young.last.pose.translation()  # type: ignore[union-attr]
-    assert np.hypot(*apart_m[:2]) < 3.0

@@ -66,7 +66,9 @@ _ROWS: dict[str, tuple[str, str, str, Bounds | None, Bounds | None, Callable[[Ev
     "interval": ("AC-14", "GPS_INPUT interval, p99", "ms", _most(120.0), None, of.gps_interval_p99_ms),
     "gap": ("AC-14", "longest gap between GPS_INPUT", "ms", _most(245.0), None, of.gps_longest_gap_ms),
     "first position": ("AC-15", "first position after the start", "s", _most(30.0), _most(15.0), of.first_position_s),
-    "found again": ("AC-15", "back within 50 m afterwards", "s", _most(30.0), _most(15.0), of.relocalized_after_s),
+    "found again": (
+        "AC-15", "back within 50 m afterwards", "s", _most(of.RELOCALIZED_FLOOR_S), _most(15.0),
+        of.relocalized_after_s),
     "memory": ("AC-16", "peak memory", "MB", _most(8192.0), _most(2048.0), of.memory_mb),
     "vehicle error": (
         "ON-6", "error of the autopilot's own position, worst", "m", _most(200.0), _most(50.0), of.vehicle_error_m),

@@ -19,6 +19,7 @@ from terrafix_lab.accept.measuring.results import Measured, Verdict
 from terrafix_lab.faults.edits import Span
 
 MAP_FLOOR_PX = 2.5  # AC-10
+RELOCALIZED_FLOOR_S = 30.0  # AC-15
 NEAR_M = 50.0  # AC-1; also the limit of a correct position after a fault (AC-3)
 MIN_PATH_M = 100.0  # a relative drift over a shorter path has no meaning
 UNKNOWN_M, REQUEST_FRAMES, REQUEST_S = 100.0, 3, 2.0  # AC-6: 1-sigma of an unknown position, for so long
@@ -234,13 +235,18 @@ def first_position_s(e: Evidence) -> Measured:
 
 
 def relocalized_after_s(e: Evidence) -> Measured:
-    """From the end of the last marked span, or from the start, to the first of 5 consecutive frames within 50 m."""
+    """From the end of the last marked span, or from the start, to the first of 5 consecutive frames within 50 m.
+
+    A flight that ends sooner than RELOCALIZED_FLOOR_S after it decides nothing."""
     end_s = e.marks.spans[-1].to_s if e.marks.spans else e.frames[0].t_s
     after = [f for f in e.frames if f.t_s >= end_s and f.compared]
     for i, frame in enumerate(after):
         if all(_near(f) for f in after[i : i + 5]):
             return Measured(frame.t_s - end_s)
-    return Measured(None, "never", Verdict.BELOW) if after else Measured(None, "the flight ends before")
+    flown_s = after[-1].t_s - end_s if after else 0.0
+    if flown_s < RELOCALIZED_FLOOR_S:
+        return Measured(None, f"not yet when the flight ends {flown_s:.0f} s later")
+    return Measured(None, "never", Verdict.BELOW)
 
 
 def memory_mb(e: Evidence) -> Measured:

@@ -2,8 +2,8 @@
 
 It models the GPS-related behaviour of ArduPilot 4.6; tests compare it with measurements on the firmware. It has no
 thread, socket or clock. Not simulated: several filter lanes and their switching, yaw and attitude as states (the
-readings contain them), blending of two GPS, ODOMETRY and other external navigation, flight modes. A fail-safe is
-therefore reported and counted, but the vehicle continues.
+readings contain them), blending of two GPS, ODOMETRY and other external navigation, flight modes, pre-arm checks. A
+fail-safe is therefore reported and counted, but the vehicle continues.
 
 Measured on the firmware and not reproduced here (docs/closed-loop.md has details): the small share of a step of 200 m
 that is taken over in 30 s at an accuracy of 100 m; LAND after a reset onto 120 m, and when a copter's velocity is
@@ -21,12 +21,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.link.output.gps_time import GPS_EPOCH_UNIX_S, gps_minus_utc_s
-from terrafix_lab.sim.autopilot.navigation.align import STOPPED_AFTER_S, Alignment, prearm_failures
+from terrafix_lab.sim.autopilot.navigation.align import STOPPED_AFTER_S, Alignment
 from terrafix_lab.sim.autopilot.navigation.ekf import Ekf, Fusion
 from terrafix_lab.sim.autopilot.navigation.gps import WEEK_S, Fix, GpsInputDriver, GpsInstance
 from terrafix_lab.sim.autopilot.navigation.receivers import Receivers
 from terrafix_lab.sim.autopilot.navigation.status import (
-    CRITICAL,
     EXTERNAL_AFTER_S,
     INFO,
     Sources,
@@ -40,7 +39,6 @@ from terrafix_lab.sim.interfaces import Navigation, Readings
 
 BOOT_OFFSET_S = 42.0  # The autopilot's clock differs from ours by its start
 CLOCK_DRIFT = 20e-6  # and by the drift of its oscillator.
-PREARM_PERIOD_S = 30.0
 AIRBORNE_M = 3.0  # barometric height above home from which the vehicle counts as armed and flying
 SOURCE_GPS = 3  # EK3_SRCn_POSXY, VELXY
 SOURCE_SETS = 3
@@ -97,10 +95,8 @@ class SimAutopilot:
         self._alignment = Alignment(kind, good=start is not None)
         self._source_set = 1
         self._home_amsl_m = home_amsl_m
-        self._using_since_s: float | None = None
         self._unix_minus_flight_s: float | None = None
         self._readings: Readings | None = None
-        self._prearm_s = -math.inf
 
     @property
     def wire(self) -> Wire:
@@ -159,10 +155,6 @@ class SimAutopilot:
         age_s = self._readings.t_s - fix.t_s
         raw = np.array([e_m + ve * age_s, n_m + vn * age_s, filtered.p_b_in_w_m[2]])
         return replace(filtered, p_b_in_w_m=raw)
-
-    def prearm(self, now_s: float) -> list[str]:
-        """Returns the reasons not to arm."""
-        return prearm_failures(self.gps, self._alignment, self._using_since_s, self.parameters, self.kind, now_s)
 
     # --- GPS ---
 
@@ -243,11 +235,6 @@ class SimAutopilot:
         )
         if not self.status.aiding and self.ekf is not None:
             self.ekf.hold_position()
-        if self.status.absolute and self._using_since_s is None:
-            self._using_since_s = now_s
-        if not self.armed and now_s - self._prearm_s >= PREARM_PERIOD_S:
-            self._prearm_s = now_s
-            self._send_texts([(CRITICAL, f"PreArm: {text}") for text in self.prearm(now_s)], now_s)
 
     def _send_texts(self, texts: Iterable[StatusMessage], now_s: float) -> None:
         for severity, text in texts:

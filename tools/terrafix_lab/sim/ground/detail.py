@@ -15,7 +15,6 @@ NEUTRAL = 128  # value of factor 1
 # (sigma of a smoothing, weight): structure of clods and tufts without larger patches
 GRAINS_PX = ((0.8, 1.0), (1.6, 1.0), (4.0, -0.5))
 BORDER_PX = 16  # reach of the widest smoothing
-COARSEST_LEVEL = 3  # coarser levels average the texture out
 CACHE_BYTES = 48 << 20
 
 

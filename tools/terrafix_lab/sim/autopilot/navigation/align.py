@@ -1,10 +1,6 @@
-"""Alignment before the first use of GPS: the checks of ArduPilot's filter, and its pre-arm checks."""
+"""Alignment before the first use of GPS: the checks of ArduPilot's filter."""
 
-from collections.abc import Sequence
-
-from terrafix.link.integrity.output_predictor import distance_m
-from terrafix_lab.sim.autopilot.navigation.gps import NO_GPS, Fix, GpsInputDriver, GpsInstance
-from terrafix_lab.sim.autopilot.navigation.switch import BLEND
+from terrafix_lab.sim.autopilot.navigation.gps import Fix
 from terrafix_lab.sim.autopilot.parameters import Kind
 
 CHECK_SATS, CHECK_HDOP, CHECK_SPEED, CHECK_POSITION = 1, 2, 4, 8  # EK3_GPS_CHECK; 16, yaw, is not simulated
@@ -16,9 +12,6 @@ ALIGN_S = 10.0  # the checks must pass this long; then they are good, and the fi
 HYSTERESIS, BAD_AFTER_S = 1.3, 5.0
 STOPPED_AFTER_S = 15.0  # without any aid; then a filter needs good checks (AP_NavEKF3_Control.cpp, setAidingMode)
 USE_AFTER_S = {Kind.PLANE: 1.4, Kind.COPTER: 10.6}  # from the origin to "is using GPS"
-ARM_AFTER_S = 1.0  # time from there until the pre-arm checks pass
-MAX_GPS_DISTANCE_M = 50.0
-ARM_ALL, ARM_GPS = 1, 8  # ARMING_CHECK
 
 
 def passes_checks(fix: Fix, check: int, scale: float) -> bool:
@@ -65,49 +58,3 @@ class Alignment:
         """No 3D fix: restarts checks that have not passed yet."""
         if not self.good:
             self._fail_s = None
-
-
-def prearm_failures(
-    gps: Sequence[GpsInstance | None],
-    alignment: Alignment,
-    using_since_s: float | None,
-    parameters: dict[str, float],
-    kind: Kind,
-    now_s: float,
-) -> list[str]:
-    """Returns the reasons not to arm, in ArduPilot's words without "PreArm: "; empty: arming is possible.
-
-    ``using_since_s``: time since when the filter uses GPS.
-    """
-    checks = int(parameters["ARMING_CHECK"])
-    failures = _gps_failures(gps, int(parameters["GPS_AUTO_SWITCH"]), now_s) if checks & (ARM_ALL | ARM_GPS) else []
-    if kind is Kind.COPTER and any(isinstance(g, GpsInputDriver) and _configuring(g) for g in gps):
-        return [*failures, "EKF attitude is bad"]
-    if alignment.origin_s is None:
-        return [*failures, "AHRS: waiting for home"]
-    if using_since_s is None or now_s - using_since_s < ARM_AFTER_S:
-        return [*failures, "Need Position Estimate"]
-    return failures
-
-
-def _configuring(gps: GpsInstance) -> bool:
-    """Fix type 0 at boot keeps a copter's filter from starting: it waits for the receiver's configuration."""
-    return gps.has_reported() and gps.fix_type == NO_GPS and not gps.timed_out
-
-
-def _gps_failures(gps: Sequence[GpsInstance | None], switch: int, now_s: float) -> list[str]:
-    present = [g for g in gps if g is not None]
-    failures = []
-    for g in present:
-        if not g.has_fix():
-            failures.append(f"GPS {g.instance + 1}: Bad fix")
-        elif not g.healthy(now_s):
-            failures.append(f"GPS {g.instance + 1}: not healthy")
-    fixes = [g.fix for g in present if g.has_fix() and g.fix is not None]
-    if len(fixes) == 2:
-        distance_apart_m = distance_m(fixes[0].lat_deg, fixes[0].lon_deg, fixes[1].lat_deg, fixes[1].lon_deg)
-        if distance_apart_m > MAX_GPS_DISTANCE_M:
-            failures.append(f"GPS positions differ by {distance_apart_m:.0f}m")
-    if switch == BLEND and len(present) == 2 and failures:
-        failures.append("GPS blending unhealthy")
-    return failures
