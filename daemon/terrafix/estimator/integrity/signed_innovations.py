@@ -19,8 +19,8 @@ INNOVATION_FALSE_ALARM_HOURS = 3.0  # [spec: one in some flights]
 INDEPENDENT_RUNS = 2.2  # of those that end with an innovation [measured: docs/decisions/059]
 RUN_SIZE = 5  # innovations of the longest run: the velocity has followed by then [measured: docs/decisions/059]
 MIN_RUN = 2  # innovations: one is an outlier [spec: no run]
-# Claims of odometry contain what all of its motions have in common (height, lens), and the velocity they are compared with
-# has it, too: their innovations are smaller than claimed. Least share of the variance that is left to them.
+# Claims of odometry contain what all of its motions have in common (height, lens), and the velocity that they are
+# compared with has it, too: innovations are smaller than claimed. Least share of the variance that is left to them.
 MIN_VARIANCE_SHARE = 0.5  # [measured: docs/decisions/059]
 MAX_SIGMAS = math.sqrt(GATE[3])  # of an innovation that counts; a larger one is an outlier as well [spec: core/gate.py]
 
