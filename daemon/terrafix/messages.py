@@ -663,9 +663,7 @@ class RefinementSource(StrEnum):
 class RefinedPose(msgspec.Struct, frozen=True, kw_only=True):
     """Camera at frame ``frame_id``. ``cov_en_m2``: covariance of east and north.
 
-    ``cov``: position [m], then rotation [rad], world axes; its horizontal part is that of the sigmas. The estimator's
-    own refinement (FLIGHT) refines positions: the orientation is that with which the frame has left the window, and
-    the terms between both are zero."""
+    ``cov``: position [m], then rotation [rad], world axes; its horizontal part is that of the sigmas."""
 
     frame_id: int
     lat_deg: float

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.core.geodesy import rot_from_quat
-from terrafix.estimator.filter_state import ORIENTATION_SIZE, FilterState, FrameInput, FrameState, ImuQuery
+from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState, ImuQuery
 from terrafix.estimator.graph.pose_graph import PoseGraph
 from terrafix.estimator.integrity.doubts import Doubts
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
@@ -19,7 +18,6 @@ from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.prior import NavPrior
 from terrafix.estimator.propagation import Propagation, PropagationResult
 from terrafix.estimator.relocalization_update import RelocalizationResult, RelocalizationUpdate
-from terrafix.estimator.state import POSE_SIZE
 from terrafix.messages import MapMatch, Origin, Relocalization
 
 
@@ -103,14 +101,12 @@ class Estimator:
         self._map_update.forget_rejected()
 
     def refine(self) -> dict[int, PastPose]:
-        """After landing: frame -> camera, whose position is by all that was measured in the flight; only of frames that
-        a place stands behind."""
+        """After landing: frame -> camera by all that was measured in the flight; only of frames that a place stands
+        behind."""
         result, state, doubts_m2 = dict[int, PastPose](), self.state, self.doubts.of_frames()
-        state.keep_orientations(state.graph.window)
-        orientations = np.array(state.orientations, float).reshape(-1, ORIENTATION_SIZE)
         jacobians = np.array(state.principal_point_jacobians).reshape(-1, 2, 2)
         frames = zip(state.frames, jacobians, *state.graph.refine(), strict=True)
-        for node, (frame, jacobian, p_m, cov) in enumerate(frames):
+        for node, (frame, jacobian, p_m, r_w_c, cov) in enumerate(frames):
             if state.first_placed_node is None or node < state.first_placed_node:
                 continue
             if np.isfinite(p_m).all() and np.isfinite(cov).all():
@@ -119,9 +115,5 @@ class Estimator:
                 shift_m, shift_cov = state.principal_point.shift(jacobian)
                 p_m[:2] += shift_m
                 cov[:2, :2] += shift_cov
-                full = np.zeros((POSE_SIZE, POSE_SIZE))
-                full[:3, :3], full[3:, 3:] = cov, orientations[node, 4:].reshape(3, 3)
-                w, x, y, z = orientations[node, :4].tolist()
-                r_w_c = rot_from_quat((w, x, y, z))
-                result[frame] = PastPose(p_m, r_w_c, full, state.fragment_ids[node])
+                result[frame] = PastPose(p_m, r_w_c, cov, state.fragment_ids[node])
         return result

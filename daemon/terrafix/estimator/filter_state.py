@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.covariances import Covariances
 from terrafix.estimator.graph.pose_graph import PoseGraph
@@ -29,12 +28,11 @@ from terrafix.estimator.models.motion_model import WorldAcceleration
 from terrafix.estimator.models.speed_prior import SpeedPrior
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.estimator.monitors.image_orientation import OrientationMonitor
-from terrafix.estimator.state import HEIGHT, LOG_HEIGHT_SCALE, MOTION_SIZE, RADIAL_K1, UP, VELOCITY, WORLD_ROTATION
+from terrafix.estimator.state import HEIGHT, LOG_HEIGHT_SCALE, MOTION_SIZE, RADIAL_K1, UP, VELOCITY
 from terrafix.messages import Camera, CovarianceMode, LensEstimate, Odometry, Origin
 
 # Time for which a frame that has left the window is known: the longest that the anchor works on a match.
 LEFT_S = 90.0  # [spec: stuck_after_s of the anchor, processes.py]
-ORIENTATION_SIZE = 4 + 9  # numbers of an orientation and its covariance [spec: quaternion and (3, 3)]
 LENS_SURE = 3.0  # sigmas, from which a lens distortion is applied: no lens has exactly none [tuned]
 
 
@@ -139,9 +137,6 @@ class FilterState:
         self.keyframe_of: dict[int, int] = {}  # node -> frame, of the keyframes among them
         self.frames = array("q")  # frame of each node since the flight began
         self.principal_point_jacobians = array("f")  # ... and its ``principal_point_jacobian`` (2, 2)
-        self.orientations = array(
-            "f"
-        )  # ... q_w_c (4) and covariance (3, 3) of its rotation, world axes, when last known
         self.fragment_ids = array("q")  # ... and its fragment
 
     @property
@@ -207,16 +202,7 @@ class FilterState:
             self.keyframe_of[node] = frame_id
         self.frames.append(frame_id)
         self.principal_point_jacobians.extend(self.principal_point_jacobian(pose).ravel())
-        self.orientations.extend(np.zeros(ORIENTATION_SIZE))
         self.fragment_ids.append(fragment.fragment_id)
-
-    def keep_orientations(self, nodes: Iterable[int]) -> None:
-        """Of nodes that leave the window, or are in it at the end of the flight."""
-        for node in nodes:
-            r_w_c, cov = self.graph.state(node).pose.rotation().matrix(), self.covariances.recorded_pose(node)
-            rotation = tangent_to_world(cov, r_w_c)[WORLD_ROTATION, WORLD_ROTATION]
-            at = slice(node * ORIENTATION_SIZE, (node + 1) * ORIENTATION_SIZE)
-            self.orientations[at] = array("f", [*quat_from_rot(r_w_c), *rotation.ravel()])
 
     def fragment_of(self, frame_id: int) -> Fragment | None:
         """The fragment of a frame in the window; None: it has left the window, or is registered to no fragment."""
@@ -239,8 +225,6 @@ class FilterState:
 
     def keep_keyframes(self, leaving: Iterable[int]) -> None:
         """The nodes ``leaving`` are about to leave the window."""
-        leaving = list(leaving)
-        self.keep_orientations(leaving)
         for node in leaving:
             past = PastFrame(
                 self.graph.time_of(node), self.graph.state(node).pose, self.covariances.recorded_pose(node)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from refined_track import ANCHOR_COV, Track
-from simulated_flight import ORIGIN
+from simulated_flight import ORIGIN, PLACE
 from terrafix.core.config import Config, SmootherSection
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import rot_from_quat
@@ -132,6 +132,22 @@ def test_a_frame_with_two_possible_positions_reaches_both() -> None:
     doubtful = msgspec.structs.replace(track.link(39, 38), ambiguity_m2=(900.0, 0.0, 0.0, 0.0))
     track.feed([track.prediction(39), doubtful, *(track.anchor(i) for i in range(40)), track.prediction(46)])
     assert track.refined[39].sigma_e_m == pytest.approx(30.0, rel=0.01) and track.refined[39].sigma_n_m < 1.0
+
+
+def test_the_estimated_principal_point_moves_all_frames_by_its_lever_and_widens_them() -> None:
+    refined = []
+    for axis, variance in (((0.0, 0.0), 0.0), ((0.02, -0.01), 1e-4)):
+        track = Track(side_m=2000.0)
+        track.fly(0, 20)
+        seen = {"axis": axis, "axis_cov": (variance, 0.0, 0.0, variance)}
+        anchors = [msgspec.structs.replace(track.anchor(i), **seen) for i in (0, 10, 19)]
+        track.feed([*anchors, track.prediction(26)])
+        refined.append(track.refined[5])
+    described, estimated = refined
+    before_m, after_m = (np.array(PLACE.to_local(p.lat_deg, p.lon_deg)) for p in refined)
+    moved_m = after_m - before_m
+    assert moved_m == pytest.approx([1.0, -2.0], abs=0.05), "image top east, 100 m above ground"
+    assert estimated.sigma_e_m**2 - described.sigma_e_m**2 == pytest.approx(1.0, abs=0.05)
 
 
 def test_the_covariance_grows_with_the_distance_from_the_map_matches() -> None:

@@ -7,7 +7,7 @@ between two retained ones are eliminated exactly, and their positions depend on 
 A node is retained where it separates the graph: a keyframe does, but for the three-view factor of which it is the
 middle one, which is dropped. (Retaining the keyframe before it as well was tried: the covariances of a chain in which
 each pair of nodes depends on another pair are lost in rounding.) When too many nodes are retained, some of them are
-eliminated. So the time per frame is constant, and the memory grows by some 290 bytes a frame."""
+eliminated. So the time per frame is constant, and the memory grows by some 520 bytes a frame."""
 
 from bisect import bisect_left, bisect_right
 from contextlib import suppress
@@ -95,9 +95,10 @@ class MarginalizedHistory:
         self._held.clear()
         self._segment_starts.add(node)
 
-    def refine(self) -> tuple[np.ndarray, np.ndarray]:
-        """After landing, when all nodes have left: position (N, 3) of each node given all measurements, and its
-        covariance (N, 3, 3), world axes; nan where indeterminate: the caller keeps the estimate made in flight."""
+    def refine(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """After landing, when all nodes have left: position (N, 3) and orientation r_w_c (N, 3, 3) of each node given
+        all measurements, and their covariance (N, 6, 6), position, then rotation, world axes; nan where indeterminate:
+        the caller keeps the estimate made in flight."""
         self._close()
         intervals = [(a, b) for a, b in pairwise(self._retained) if b not in self._segment_starts]
         poses = {node: self._values[node][0] for node in self._retained}
@@ -132,7 +133,7 @@ class MarginalizedHistory:
             self._linear = [f.relinearized(node, change) for f in self._linear]
         elif node in self._segment_starts:
             self._retained.append(node)
-        self._trajectory.put(node, np.asarray(values[0].translation()))
+        self._trajectory.put(node, values[0])
 
     def _next_retained(self) -> int | None:
         """The next node that separates older from newer nodes: no factor reaches across, but for a three-view factor,

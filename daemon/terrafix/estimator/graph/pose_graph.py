@@ -281,9 +281,9 @@ class PoseGraph:
         """Keys of C and B of the node that is added next."""
         return C(self._next), B(self._next)
 
-    def refine(self) -> tuple[np.ndarray, np.ndarray]:
-        """After landing: position (N, 3) of every node given all measurements, and covariance (N, 3, 3), world axes;
-        nan where these are indeterminate."""
+    def refine(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """After landing: position (N, 3), orientation (N, 3, 3) and covariance (N, 6, 6) of every node given all
+        measurements, as of MarginalizedHistory."""
         self._marginalize_all()
         return self._history.refine()
 

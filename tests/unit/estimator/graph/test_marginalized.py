@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C, V
 
+from terrafix.core.pose import log_so3, tangent_to_world
 from terrafix.estimator.graph import marginalized
 from terrafix.estimator.graph.elimination import NODE_SIZE, GaussianFactor, IndeterminateError, eliminate, solve
 from terrafix.estimator.graph.fixed_lag import FixedLagSmoother
@@ -145,8 +146,8 @@ class Chain:
                 self.left_with.insert_or_assign(key, at)
         return values
 
-    def batch(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3) and covariances (N, 3, 3) by GTSAM, everything at once."""
+    def batch(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions (N, 3), orientations (N, 3, 3) and covariances (N, 6, 6) by GTSAM, everything at once."""
         graph = gtsam.NonlinearFactorGraph()
         for factors in self.factors:
             graph.push_back(factors)
@@ -154,12 +155,12 @@ class Chain:
         marginals = gtsam.Marginals(graph, values)
         poses = [values.atPose3(C(i)) for i in range(self.nodes)]
         turns = [p.rotation().matrix() for p in poses]
-        cov = [r @ marginals.marginalCovariance(C(i))[3:, 3:] @ r.T for i, r in enumerate(turns)]
-        return np.array([p.translation() for p in poses]), np.array(cov)
+        cov = [tangent_to_world(marginals.marginalCovariance(C(i)), r) for i, r in enumerate(turns)]
+        return np.array([p.translation() for p in poses]), np.array(turns), np.array(cov)
 
 
 def sigmas(cov: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) -> (N, 2) horizontal."""
+    """(N, 6, 6) -> (N, 2) horizontal."""
     return np.asarray(np.sqrt(cov[:, [0, 1], [0, 1]]))
 
 
@@ -172,14 +173,19 @@ def test_refinement_equals_the_batch_optimisation_of_the_whole_flight(
     monkeypatch.setattr(marginalized, "MAX_RETAINED", max_retained)
     chain = Chain(260, fixes={*range(10, 100, 10), *range(200, 260, 10)})
     past = chain.flown(MarginalizedHistory())
-    p_m, cov = past.refine()
+    p_m, r_w_c, cov = past.refine()
     assert len(past._retained) <= max_retained + 1 and len(past._linear) <= max_retained + 1
-    exact_m, exact_cov = chain.batch()
+    exact_m, exact_r, exact_cov = chain.batch()
     flown_m = np.array([chain.left_with.atPose3(C(i)).translation() for i in range(260)])
     assert np.linalg.norm(flown_m - exact_m, axis=1).max() > 12.0  # the error to correct
     off_m = np.linalg.norm(p_m - exact_m, axis=1) / sigmas(exact_cov).max(axis=1)
     assert off_m.max() < 0.8 and np.median(off_m) < 0.1
     assert sigmas(cov) == pytest.approx(sigmas(exact_cov), rel=0.06)
+    one_sigma = np.sqrt(np.diagonal(exact_cov, axis1=1, axis2=2))
+    off_rad = np.array([log_so3(r @ exact.T) for r, exact in zip(r_w_c, exact_r, strict=True)])
+    assert np.median(np.abs(off_rad) / one_sigma[:, 3:]) < 0.1 and np.abs(off_rad / one_sigma[:, 3:]).max() < 1.0
+    correlation = (cov - exact_cov) / one_sigma[:, :, None] / one_sigma[:, None, :]
+    assert np.abs(correlation).max() < 0.2, "of position with rotation as well"
 
 
 def test_a_factor_that_is_kept_does_not_hold_the_matrix_that_it_came_from() -> None:
@@ -204,7 +210,7 @@ def test_retained_nodes_and_factors_are_bounded_in_a_long_flight() -> None:
     past = Chain(1700, fixes=set(range(0, 1700, 20))).flown(MarginalizedHistory())
     assert marginalized.MAX_RETAINED - 2 <= len(past._retained) <= marginalized.MAX_RETAINED
     assert max(len(past._linear), len(past._values)) < marginalized.MAX_RETAINED + 3 * MAX_UNSEPARATED
-    p_m, cov = past.refine()
+    p_m, _, cov = past.refine()
     assert p_m.shape == (1700, 3) and np.isfinite(p_m).all()
     assert np.linalg.eigvalsh(cov).min() > 0.0
 
@@ -215,8 +221,8 @@ def test_a_stationary_vehicle_with_one_parent_node_is_refined_like_the_batch() -
     chain = Chain(300, fixes={10, 20, 30, 260, 270, 280}, stationary=stationary)
     past = chain.flown(MarginalizedHistory())
     assert len(past._values) < 120
-    p_m, cov = past.refine()
-    exact_m, exact_cov = chain.batch()
+    p_m, _, cov = past.refine()
+    exact_m, _, exact_cov = chain.batch()
     assert np.linalg.norm(p_m - exact_m, axis=1).max() < 0.3
     assert (sigmas(cov) / sigmas(exact_cov)).min() > 0.97
 
@@ -229,9 +235,9 @@ def test_a_reset_graph_is_refined_as_two_segments() -> None:
     for factors in second.factors:
         past.add(_renumbered(factors, 48))
     past.marginalize(list(range(48, 78)), _later(second.left_with, 48, 30))
-    p_m, cov = past.refine()
+    p_m, _, cov = past.refine()
     for part, chain in ((slice(0, 48), first), (slice(48, 78), second)):
-        exact_m, exact_cov = chain.batch()
+        exact_m, _, exact_cov = chain.batch()
         assert np.linalg.norm(p_m[part] - exact_m, axis=1).max() < 0.3
         assert sigmas(cov[part]) == pytest.approx(sigmas(exact_cov), rel=0.1)
 
@@ -259,7 +265,7 @@ def test_an_indeterminate_stretch_does_not_affect_the_rest_of_the_flight() -> No
     bad.add(gtsam.PriorFactorVector(V(52), np.full(MOTION_SIZE, np.nan), gtsam.noiseModel.Unit.Create(MOTION_SIZE)))
     past.add(bad)
     past.begin_segment = lambda node: None  # type: ignore[method-assign] # a segment starts at node 0 anyway
-    p_m, cov = Chain(120, fixes=set(range(0, 120, 10))).flown(past).refine()
+    p_m, _, cov = Chain(120, fixes=set(range(0, 120, 10))).flown(past).refine()
     lost = np.flatnonzero(~np.isfinite(p_m).all(axis=1))
     assert 52 in lost and len(lost) <= 2 * marginalized.MIN_SPACING
     assert np.isfinite(cov[np.isfinite(p_m).all(axis=1)]).all()
