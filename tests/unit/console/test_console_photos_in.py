@@ -118,9 +118,11 @@ def test_a_zip_a_folder_and_a_flight_folder_give_the_same_photos_as_files(
         begin(window, console)
         window.drop("form.new .drop", [given])
         window.wait("document.getElementById('f-fx').value !== ''")
+        said = note(window, "agl_m")
         flight_id = create(window, console)
         uploaded(window, flight_id)
         assert names_of(console, flight_id) == NAMES
+    assert said == "of each photo, from frames.csv"
     stored = console.send("GET", f"/flights/{flight_id}").json
     assert (stored["name"], stored["start"]["sigma_m"]) == ("north field", 4.0)
     with console.service.database.read() as db:

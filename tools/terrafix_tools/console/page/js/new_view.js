@@ -140,7 +140,8 @@ export class NewView {
       for (const [id, topic, value] of [["agl_m", "height", facts.height_m], ["yaw_deg", "heading", facts.yaw_deg]]) {
         this[id].value = "";
         this[id].placeholder = value ?? "";
-        this.notes[id].textContent = value === null ? t("not_stated") : text(topic);
+        const inTable = found.table?.split(/\r?\n/, 1)[0].split(",").includes(id);
+        this.notes[id].textContent = inTable ? t("from_table") : value === null ? t("not_stated") : text(topic);
       }
       this.facts.hidden = false;
       fill(this.facts, h("summary", {}, t("stated")), h("dl", {class: "pairs"}, facts.facts.map((fact) => [h("dt", {}, t(`topic_${fact.topic.replaceAll(" ", "_")}`)), h("dd", {}, fact.text)])));

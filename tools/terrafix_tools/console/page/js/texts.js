@@ -89,7 +89,7 @@ const EN = {
   upload_again: "{0}; the batch is sent again", upload_failed: "The upload has stopped; add the remaining photos again.",
  
   f_folder: "Choose a folder", drop_here: "None yet. They can also be dropped anywhere on this page.", no_photos: "There is no JPEG or PNG among these files.", bad_zip: "{0} is damaged or encrypted.",
-  f_complete: "These are all photos: complete the flight when they are computed", stated: "What the photos state, and from where", from_photos: "from the photos", not_stated: "not stated by the photos", by_hand: "changed by you",
+  f_complete: "These are all photos: complete the flight when they are computed", stated: "What the photos state, and from where", from_photos: "from the photos", from_table: "of each photo, from frames.csv", not_stated: "not stated by the photos", by_hand: "changed by you",
   topic_camera: "Camera", topic_mount: "Mount", topic_start: "Start", topic_height: "Height", topic_heading: "Heading", topic_tilt: "Tilt", topic_clock: "Time", topic_rate: "Rate", topic_left_out: "Left out",
   copied_photos: "The {0} photos of “{1}”", copy_flight: "Compute a flight again", from_copied: "as before", compute_again: "Compute it again", duplicate: "Again with changes", cancel: "Cancel", cancelled: "Cancelled. What was uploaded stays.",
   all_there: "These photos are there already, up to {0}.", resume: "{0} of {1} photos are here.", resume_choose: "Choose the same photos to go on", retry: "Try again", failed_why: "The flight cannot go on.", helped: "All photos are computed: the position that you gave needs a new computation.",
@@ -187,7 +187,7 @@ const DE = {
   upload_again: "{0}; die Gruppe wird erneut gesendet", upload_failed: "Das Hochladen wurde abgebrochen; die übrigen Fotos erneut hinzufügen.",
  
   f_folder: "Ordner wählen", drop_here: "Noch keine. Sie können auch irgendwo auf diese Seite gezogen werden.", no_photos: "Unter diesen Dateien ist kein JPEG oder PNG.", bad_zip: "{0} ist beschädigt oder verschlüsselt.",
-  f_complete: "Das sind alle Fotos: den Flug abschließen, wenn sie berechnet sind", stated: "Was die Fotos angeben, und woher", from_photos: "aus den Fotos", not_stated: "von den Fotos nicht angegeben", by_hand: "von Hand geändert",
+  f_complete: "Das sind alle Fotos: den Flug abschließen, wenn sie berechnet sind", stated: "Was die Fotos angeben, und woher", from_photos: "aus den Fotos", from_table: "je Foto, aus frames.csv", not_stated: "von den Fotos nicht angegeben", by_hand: "von Hand geändert",
   topic_camera: "Kamera", topic_mount: "Halterung", topic_start: "Startpunkt", topic_height: "Höhe", topic_heading: "Steuerkurs", topic_tilt: "Neigung", topic_clock: "Zeit", topic_rate: "Bildfolge", topic_left_out: "Ausgelassen",
   copied_photos: "Die {0} Fotos von „{1}“", copy_flight: "Flug erneut berechnen", from_copied: "wie zuvor", compute_again: "Erneut berechnen", duplicate: "Erneut mit Änderungen", cancel: "Abbrechen", cancelled: "Abgebrochen. Was hochgeladen ist, bleibt.",
   all_there: "Diese Fotos sind schon vorhanden, bis {0}.", resume: "{0} von {1} Fotos sind hier.", resume_choose: "Dieselben Fotos wählen, um fortzufahren", retry: "Erneut versuchen", failed_why: "Der Flug kann nicht weitergehen.", helped: "Alle Fotos sind berechnet: die angegebene Position verlangt eine neue Berechnung.",
