@@ -5,6 +5,10 @@ A RANSAC pose depends on patches whose own maximum is at the right place. Where 
 these may be too few, while the sum of all patch surfaces still shows where most of the ground is.
 """
 
+from dataclasses import replace
+
+import numpy as np
+
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, PatchFix, View
 from terrafix.anchor.verification.hypothesis_tracker import TRACK_LLR_MAX, evidence
 from terrafix.anchor.verification.patch_null import PatchNull
@@ -25,4 +29,11 @@ class ConsensusPose:
             return None
         if evidence(PatchNull().sigmas(first.consensus, fine=False)) < TRACK_LLR_MAX:
             return None
-        return self._verifier.refine(image, view, first.fix)
+        refined = self._verifier.refine(image, view, first.fix)
+        if refined is None or refined.pnp.fit is None:
+            return refined
+        fit, open_m2 = refined.pnp.fit, np.zeros((3, 3))
+        open_m2[:2, :2] = first.consensus.open_cov * view.agl_m**2
+        cov = fit.cov.copy()
+        cov[3:, 3:] += fit.r_w_c.T @ open_m2 @ fit.r_w_c
+        return replace(refined, pnp=replace(refined.pnp, fit=replace(fit, cov=cov)))

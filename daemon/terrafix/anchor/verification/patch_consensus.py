@@ -24,6 +24,8 @@ SCALE_RANGE, SCALE_STEPS = 0.08, 7  # half range of the scale grid, relative, an
 # 1-sigma of the yaw and scale error that a hypothesis of the search leaves [tuned]
 YAW_SIGMA_RAD, PATCH_SCALE_SIGMA = np.radians(5.0), 0.05
 PATCH_SPREAD = 0.02  # share of the height, 1-sigma of a patch's displacement by relief and leaning buildings [tuned]
+CHANCE_SIGMAS = 3.0 * 2.0**0.5  # of the difference of two sums [spec: 99.7 %]
+SIGMA_OF_MAD = 1.4826  # of a normal distribution [spec: Rousseeuw and Croux 1993]
 # log weight of a cell by its standardised correlation [spec: a tenth of a sigma below the peak counts half]
 PEAK_SHARPNESS = 6.0
 # shares of the height: search radius of the patches in successive Gauss-Newton iterations [tuned]
@@ -34,12 +36,15 @@ SEARCH_RADII = (0.05, 0.04, 0.03, 0.03)
 class PatchConsensus:
     """``llr``: evidence in nats before the null model is subtracted. ``motion`` (6,): east, north, yaw, scale, tilt
     about north and east; small angles, lengths in heights. ``offsets`` (N, 2): displacement of each patch from its
-    expected place, east and north in heights; ``values`` (N,): its evidence in nats."""
+    expected place, east and north in heights; ``values`` (N,): its evidence in nats. ``open_cov`` (2, 2): of the common
+    translation along the direction that the surfaces leave open, east and north in heights; none where there is a
+    peak, as wide as a height squared along an edge (aperture problem)."""
 
     llr: float
     motion: np.ndarray
     offsets: np.ndarray
     values: np.ndarray
+    open_cov: np.ndarray
 
     @property
     def inliers(self) -> np.ndarray:
@@ -64,7 +69,30 @@ def estimate_consensus(surfaces: np.ndarray, ground: np.ndarray, cell: float, ti
         motion = np.linalg.solve(hessian, np.einsum("nki,nk->i", weighted, offsets))
     offsets, value = _best_offsets(z, llr, jacobian @ motion, cell, PATCH_SPREAD)
     prior = 0.5 * float(((motion / sigma) ** 2).sum())
-    return PatchConsensus(INDEPENDENT_PATCH_SHARE * float(value.sum()) - prior, motion, offsets, value)
+    open_cov = _open_cov(llr, jacobian @ motion, cell)
+    return PatchConsensus(INDEPENDENT_PATCH_SHARE * float(value.sum()) - prior, motion, offsets, value, open_cov)
+
+
+def _open_cov(llr: np.ndarray, expected: np.ndarray, cell: float) -> np.ndarray:
+    """(2, 2) of ``PatchConsensus.open_cov``: the posterior of a common translation added to the ``expected`` offsets
+    (N, 2), less the information of the window that it is computed in, and less what both directions share. Places whose
+    evidence differs by no more than chance does (along an edge the highest one is any) are equally probable."""
+    side = llr.shape[1]
+    columns, rows = np.rint(expected / cell).astype(int).T * [[1], [-1]]
+    k = side // 2 - int(max(np.abs(columns).max(), np.abs(rows).max()))
+    if k < 1:
+        return np.zeros((2, 2))
+    total = np.zeros((2 * k + 1, 2 * k + 1))
+    for surface, row, column in zip(llr, rows + side // 2, columns + side // 2, strict=True):
+        total += surface[row - k : row + k + 1, column - k : column + k + 1]
+    chance = CHANCE_SIGMAS * SIGMA_OF_MAD * float(np.median(np.abs(total - np.median(total))))
+    mass = np.exp(-INDEPENDENT_PATCH_SHARE * np.maximum(total.max() - total - chance, 0.0))
+    north, east = np.meshgrid(np.arange(k, -k - 1, -1), np.arange(-k, k + 1), indexing="ij")
+    cov = np.cov(np.stack([east.ravel(), north.ravel()]), aweights=mass.ravel(), ddof=0) * cell**2
+    window = np.arange(-k, k + 1).var() * cell**2
+    variance, axes = np.linalg.eigh(cov + 1e-12 * np.eye(2))
+    variance = 1.0 / np.maximum(1.0 / variance - 1.0 / window, 1.0)
+    return np.asarray(axes @ np.diag(variance - variance.min()) @ axes.T)
 
 
 def _log_likelihood_ratio(z: np.ndarray) -> np.ndarray:

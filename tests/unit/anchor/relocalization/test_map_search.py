@@ -352,7 +352,7 @@ def test_yaw_and_scale_near_the_prediction_raise_the_log_odds_and_others_lower_t
 
 
 def of(llr: float, patches: int = REFERENCE_PATCHES) -> PatchConsensus:
-    return PatchConsensus(llr, np.zeros(6), np.zeros((patches, 2)), np.zeros(patches, bool))
+    return PatchConsensus(llr, np.zeros(6), np.zeros((patches, 2)), np.zeros(patches, bool), np.zeros((2, 2)))
 
 
 def test_a_consensus_at_the_level_of_the_null_model_is_no_evidence() -> None:

@@ -97,3 +97,28 @@ def test_the_pose_has_no_tilt_prior(estimator: ConsensusPose) -> None:
     fix = estimator.estimate(image, replace(believed_view, tilt_sigma_rad=1e-4))
     assert fix is not None and fix.pnp.fit is not None
     assert float(np.sqrt(fix.pnp.fit.cov[:2, :2].diagonal().min())) > 1e-3
+
+
+def edge_between_fields(seed: int) -> np.ndarray:
+    """Two fields with a straight edge through the middle, 25 degrees south of east; their crop (``seed``) differs from
+    year to year."""
+    side, turn = round(SIDE_M / GSD_M), np.radians(25.0)
+    south, east = np.mgrid[0:side, 0:side] - side / 2
+    edge = 90.0 + 70.0 / (1.0 + np.exp(-(east * np.sin(turn) - south * np.cos(turn)) * GSD_M))
+    crop = cv2.GaussianBlur(np.random.default_rng(seed).normal(0.0, 1.0, (side, side)), (0, 0), 3.0)
+    return np.dstack([np.clip(edge + 5.0 * crop / crop.std(), 0.0, 255.0).astype(np.uint8)] * 3)
+
+
+def test_along_the_only_edge_of_the_ground_the_pose_claims_more_than_across_it() -> None:
+    """The aperture problem: nothing but chance says where on the edge the camera is."""
+    world = FlatMap(edge_between_fields(1))
+    estimator = ConsensusPose(world, FrameMatcher(PINHOLE, world, GradientDescriber()))  # type: ignore[arg-type]
+    along = np.array([np.cos(np.radians(25.0)), -np.sin(np.radians(25.0))])
+    e_m, n_m = (float(v) for v in 10.0 * along)
+    believed = View(e_m, n_m, R, AGL_M, 0.0, float(np.radians(3.0)), 0.03, TILT_SIGMA_RAD)
+    image = view(edge_between_fields(2), PINHOLE, R, np.array([0.0, 0.0, AGL_M]))
+    fix = estimator.estimate(image, believed)
+    assert fix is not None and fix.pnp.fit is not None
+    cov = (fix.pnp.fit.r_w_c @ fix.pnp.fit.cov[3:, 3:] @ fix.pnp.fit.r_w_c.T)[:2, :2]
+    across = np.array([-along[1], along[0]])
+    assert along @ cov @ along > across @ cov @ across
