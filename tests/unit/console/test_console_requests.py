@@ -425,6 +425,22 @@ def test_a_flight_that_failed_is_tried_again_and_no_other(console: Console) -> N
         assert flights.image_of(db, flight_id, 3).attempts == 0
 
 
+def test_a_service_closes_its_database_after_its_processes_have_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order = []
+    with Console(settings(tmp_path)) as running:
+        end, close = running.service.workers.stop, running.service.database.close
+
+        async def ended() -> None:
+            await end()
+            order.append("processes")
+
+        monkeypatch.setattr(running.service.workers, "stop", ended)
+        monkeypatch.setattr(running.service.database, "close", lambda: (order.append("database"), close()))
+    assert order == ["processes", "database"]
+
+
 def test_what_was_finalised_is_the_first_of_the_files_of_a_flight(console: Console) -> None:
     flight_id = console.create()
     out = console.service.settings.flight(flight_id) / "out"
