@@ -127,7 +127,7 @@ class ImageAnnotations(msgspec.Struct, frozen=True, kw_only=True):
     points: list[PointsAnnotation]
 
 
-USED_COLOR, NOT_USED_COLOR = Color(0.2, 0.9, 0.4), Color(1.0, 0.7, 0.1)  # green, amber
+MATCH_USED, MATCH_NOT_USED = Color(0.2, 0.9, 0.4), Color(1.0, 0.7, 0.1)  # green, amber
 
 
 # Channels: topic and type of message. The schema is named foxglove.<type>.
@@ -198,7 +198,7 @@ def _matches(match: MapMatch, camera: CameraCalibration) -> ImageAnnotations:
     drawn = PointsAnnotation(
         timestamp=Time.of(match.t_ns),
         points=[Point2(round(float(u), 1), round(float(v), 1)) for u, v in pixels],
-        outline_color=USED_COLOR if match.verdict is Verdict.ACCEPTED else NOT_USED_COLOR,
+        outline_color=MATCH_USED if match.verdict is Verdict.ACCEPTED else MATCH_NOT_USED,
     )
     return ImageAnnotations(points=[drawn])
 
