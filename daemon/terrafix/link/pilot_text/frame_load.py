@@ -6,7 +6,7 @@ from terrafix.link.pilot_text.debounce import Debounce
 from terrafix.link.pilot_text.statustext import TOO_SLOW
 from terrafix.messages import OVERTAKEN, CalibrationFault, Frame
 
-FRAMES = 20  # newest frames that are counted [spec: 10 s at the default frame rate of 2 Hz]
+FRAMES = 10  # newest frames that are counted [spec: 5 s at the default frame rate of 2 Hz]
 
 
 class FrameLoad:

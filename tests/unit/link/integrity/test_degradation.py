@@ -35,6 +35,7 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"GPS \d agrees with the map again",
     r"position source: (map|GPS)",
     r"lost, send a position hint",
+    r"dead reckoning for [\d.]+ km, send a hint",
     r"whole map searched, send a hint",
     r"hint (accepted, searching within|agrees,|is|not used,) [\d.]+ k?m",
     r"hint (agrees,|is|not used,) [\d.]+ k?m( from the estimate| off, searching| outside the map)",
@@ -208,7 +209,7 @@ def test_a_picture_that_turns_in_flight_is_reported_to_the_pilot_as_not_used(
 @pytest.mark.parametrize("quantity", LINK_FAULTS)
 def test_telemetry_and_frames_that_are_left_out_are_a_warning_by_their_cause(quantity: str) -> None:
     node = LinkNode(10.0)
-    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail="11 of 20 frames out", active=True)
+    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail="6 of 10 frames out", active=True)
     published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
     began, ended = (message for message in published if isinstance(message, m.StatusText))
     assert is_known(began.text) and quantity in began.text and began.severity == 4
