@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[3]
 CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
-LINES = {"daemon": 40860, "engines": 1740, "tools": 63900, "tests": 68450}
-WORDS = 69400  # of all documents
+LINES = {"daemon": 41072, "engines": 1740, "tools": 64301, "tests": 69133}
+WORDS = 70500  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 
