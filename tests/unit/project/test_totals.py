@@ -12,7 +12,7 @@ CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
 LINES = {"daemon": 41072, "engines": 1740, "tools": 64301, "tests": 69133}
-WORDS = 70500  # of all documents
+WORDS = 65200  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 
