@@ -127,7 +127,7 @@ def test_matches_are_drawn_where_the_lens_shows_their_points_in_the_thumbnail() 
         matcher="gradient",
         matches=[(0.0, 0.0, 1, 2, 3, 1), (0.5, 0.0, 1, 2, 3, 1)],
     )
-    for verdict, colour in ((m.Verdict.ACCEPTED, foxglove.USED), (m.Verdict.AMBIGUOUS, foxglove.NOT_USED)):
+    for verdict, colour in ((m.Verdict.ACCEPTED, foxglove.USED_COLOR), (m.Verdict.AMBIGUOUS, foxglove.NOT_USED_COLOR)):
         found = derived(start, msgspec.structs.replace(match, verdict=verdict))
         (drawn,) = [message for topic, message in found if topic == "/matches"]
         assert isinstance(drawn, foxglove.ImageAnnotations)
