@@ -37,12 +37,7 @@ from terrafix.estimator.output import (
     refinement_of,
     verdict_of,
 )
-from terrafix.estimator.pose_estimator import (
-    EstimatedFlight,
-    OpenCVGtsamPoseEstimator,
-    PoseEstimator,
-    covariance_mode,
-)
+from terrafix.estimator.pose_estimator import EstimatedFlight, OpenCVGtsamPoseEstimator, PoseEstimator, covariance_mode
 from terrafix.estimator.prior import EstimatorCheckpoint, NavPrior, load_checkpoint
 from terrafix.estimator.propagation import PropagationResult
 from terrafix.estimator.rolling_shutter import RollingShutter

@@ -231,8 +231,7 @@ class Propagation:
         self._signed.forget()
         detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
         reset = _reset_verdict(ResetReason.VELOCITY, detail)
-        confirmed = not innovation.inertial
-        return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=confirmed)
+        return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=not innovation.inertial)
 
     def _start_off_mps(self, predicted: PredictedFrame) -> np.ndarray | None:
         if self._state.last_fix_s is not None:  # the map tells where it started

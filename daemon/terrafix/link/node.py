@@ -22,15 +22,7 @@ from terrafix.link.output.gps_time import LatchedClock
 from terrafix.link.output.send_schedule import SendSchedule
 from terrafix.link.pilot_text.debounce import Debounce
 from terrafix.link.pilot_text.frame_load import FrameLoad
-from terrafix.link.pilot_text.statustext import (
-    CRITICAL,
-    INFO,
-    LINK_FAULTS,
-    NOTICE,
-    WARNING,
-    fault_text,
-    statustext,
-)
+from terrafix.link.pilot_text.statustext import CRITICAL, INFO, LINK_FAULTS, NOTICE, WARNING, fault_text, statustext
 from terrafix.messages import (
     NO_FRAME_ID,
     CalibrationFault,

@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 
 from terrafix.core.camera import CameraCalibration
+from terrafix.core.clock import NS_PER_S
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.log_lines import MessageLog
 from terrafix.messages import MapMatch, Message, NavEstimate, Origin, Verdict
 
-NS = 1_000_000_000
 LOCATION_TOPIC, POSE_TOPIC, LOG_TOPIC, MATCHES_TOPIC = "/location", "/pose", "/log", "/matches"
 THUMBNAIL_TOPIC, IMAGE_TOPIC = "/thumbnail", "/image"
 LOCAL_FRAME = "local"  # frame of poses: east, north, up about the origin of the flight; up is AMSL
@@ -31,7 +31,6 @@ class LogLevel(IntEnum):
     INFO = 2
     WARNING = 3
     ERROR = 4
-    FATAL = 5
 
 
 class Time(msgspec.Struct, frozen=True):
@@ -41,7 +40,7 @@ class Time(msgspec.Struct, frozen=True):
     @classmethod
     def of(cls, t_ns: int) -> "Time":
         """MCAP times are unsigned, so negative times are clamped."""
-        return cls(*divmod(max(0, t_ns), NS))
+        return cls(*divmod(max(0, t_ns), NS_PER_S))
 
 
 class Stamped(msgspec.Struct, frozen=True, kw_only=True):

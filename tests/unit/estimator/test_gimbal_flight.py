@@ -144,6 +144,16 @@ def test_fact_ardupilot_reports_the_angles_of_servos_and_what_a_brushless_gimbal
     assert reports.opposes is opposes and reports.is_level is not opposes
 
 
+def test_a_gimbal_that_was_level_for_long_is_no_longer_when_its_reports_begin_to_oppose_the_lean() -> None:
+    reports = GimbalReports()
+    for i in range(40):
+        pitch_rad = math.radians(5.0 * (i % 2))
+        q = quat_from_euler(0.0, -math.pi / 2 - (pitch_rad if i >= 30 else 0.0), 0.0)
+        reports.add(GimbalAttitude(t_ns=round(2e9 * i), q=q, from_north=False), pitch_rad)
+        assert i != 29 or reports.is_level
+    assert reports.opposes and not reports.is_level
+
+
 def no_report(_i: int, _state: VehicleState) -> list[GimbalAttitude]:
     return []
 

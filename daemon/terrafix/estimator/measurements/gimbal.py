@@ -49,7 +49,7 @@ class GimbalReports:
         self._r_c_p = LOOKING_ALONG_X @ Mount().r_b_c().T
         self._reports: deque[GimbalAttitude] = deque(maxlen=BUFFER_REPORTS)
         self._changed_ns = 0  # time of the newest report that differs from the one before
-        self._compared: tuple[int, float, float] | None = None  # time, pitch of platform and vehicle
+        self._compared: tuple[int, float, float] | None = None  # time [ns], pitch of platform, vehicle [rad]
         self._opposite = self._held = 0.0  # nats for reports opposite to the vehicle's pitch, and for a level platform
 
     def describe(self, camera: Camera) -> None:
@@ -68,7 +68,7 @@ class GimbalReports:
         return () if self.gimbal is None else self.gimbal.stabilised
 
     def add(self, report: GimbalAttitude, pitch_rad: float | None) -> None:
-        """A report. Another device than the camera's does not count. ``pitch_rad``: of the vehicle then, if known."""
+        """A report. Another device than the camera's does not count. ``pitch_rad``: of the vehicle, None: unknown."""
         wanted, newest = self.gimbal.device if self.gimbal else 0, self._reports[-1] if self._reports else None
         if report.device != (wanted or (newest.device if newest else report.device)):
             return
@@ -83,16 +83,16 @@ class GimbalReports:
             self._compare(report, pitch_rad)
 
     def _compare(self, report: GimbalAttitude, pitch_rad: float) -> None:
-        """Log likelihood ratio of the changes within FROZEN_NS, summed as a CUSUM test (Page 1954): a servo at its
-        limit does not move."""
-        held_rad = float(euler_of(_product(np.array([report.q]), np.array([quat_from_rot(self._r_c_p)])))[1, 0])
+        """Log likelihood ratio of the changes between reports at least FROZEN_NS apart, summed as a CUSUM test (Page
+        1954): a servo at its limit does not move. Both sums are limited, so that a gimbal that changes is noticed."""
         if self._compared is not None and report.t_ns - self._compared[0] < FROZEN_NS:
             return
+        held_rad = float(euler_of(_product(np.array([report.q]), np.array([quat_from_rot(self._r_c_p)])))[1, 0])
         if self._compared is not None:
             turned_rad, leant_rad = held_rad - self._compared[1], pitch_rad - self._compared[2]
             nats = float((turned_rad**2 - (turned_rad + leant_rad) ** 2) / (4.0 * TILT_RAD**2))
             self._opposite = min(max(self._opposite + nats, 0.0), 2.0 * DECISIVE)
-            self._held = max(self._held - nats, 0.0)
+            self._held = min(max(self._held - nats, 0.0), 2.0 * DECISIVE)
         self._compared = report.t_ns, held_rad, pitch_rad
 
     @property

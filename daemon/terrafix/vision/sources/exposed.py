@@ -62,17 +62,17 @@ class ReportedExposures:
                 t_ns = zero_ns + round(float(found.times_s[-1]) * 1e9)
                 if t_ns <= self._newest_ns:  # the frame before had its stamp, and the latency is longer than a frame
                     break
-                self._tell(f"by {kind}", f"{kind}: {found.text()}", fits=True)
+                self._log_change(f"by {kind}", f"{kind}: {found.text()}", fits=True)
                 self._newest_ns = t_ns
                 sigma_s = max(found.jitter_s, min(frame.stamp_sigma_s, STAMP_SIGMA_S))
                 return msgspec.structs.replace(frame, t_ns=t_ns, buffered=False, stamp_sigma_s=sigma_s)
             refused = refused or f"{kind}: {found}"
         if len(self._stamps) >= REPORTED_FRAMES:
-            self._tell("none", refused or "their latency is longer than the time between two frames", fits=False)
+            self._log_change("none", refused or "their latency is longer than the time between two frames", fits=False)
         self._newest_ns = frame.t_ns
         return frame
 
-    def _tell(self, state: str, text: str, *, fits: bool) -> None:
+    def _log_change(self, state: str, text: str, *, fits: bool) -> None:
         if state == self._reported:
             return
         self._reported = state

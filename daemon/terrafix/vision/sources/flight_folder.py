@@ -12,14 +12,7 @@ from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, Origin, VehicleS
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
 from terrafix.vision.sources.exposed import exposed_times
-from terrafix.vision.sources.facts import (
-    camera_facts,
-    log_facts,
-    mount_fact,
-    rate_facts,
-    start_fact,
-    telemetry_facts,
-)
+from terrafix.vision.sources.facts import camera_facts, log_facts, mount_fact, rate_facts, start_fact, telemetry_facts
 from terrafix.vision.sources.images import WRONG_SIZE, downscaled_camera, read_image
 from terrafix.vision.sources.plausible import check_heights
 from terrafix.vision.sources.table import Row, read_table

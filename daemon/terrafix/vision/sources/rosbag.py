@@ -23,13 +23,7 @@ from terrafix.vision.sources.bag_reader import BagReader
 from terrafix.vision.sources.bag_topics import COMPRESSED, choose_topics
 from terrafix.vision.sources.camera_info import camera_of_info
 from terrafix.vision.sources.contract import Shot, TelemetryCursor
-from terrafix.vision.sources.description import (
-    Description,
-    camera_of,
-    origin_of,
-    read_description,
-    with_mount,
-)
+from terrafix.vision.sources.description import Description, camera_of, origin_of, read_description, with_mount
 from terrafix.vision.sources.facts import camera_facts, log_facts, mount_fact, rate_facts, start_fact, telemetry_facts
 from terrafix.vision.sources.images import WRONG_SIZE, decode_image, downscale_factor, downscaled_camera
 from terrafix.vision.sources.plausible import check_heights
