@@ -75,7 +75,7 @@ class FlightVerdict:
         refused += ["..."] if len(self.refused) > MAX_SHOWN_SPANS else []
         because = f" ({'; '.join([*self.reasons, *refused])})" if self.reasons or refused else ""
         cause = f" Likely cause: {self.cause}." if self.cause else ""
-        if self.asks is not None:
+        if self.asks is not None and not self.cause:  # a hint does not help where an input is wrong
             from_s, to_s, why = self.asks
             cause += f" From {from_s:.1f} s to {to_s:.1f} s {why}: a user fix or a hint there would help."
         if not self.spans or self.share == 1.0:
