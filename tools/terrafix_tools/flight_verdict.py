@@ -74,11 +74,10 @@ class FlightVerdict:
         refused = [f"{what} from {a:.1f} s to {b:.1f} s" for a, b, what in self.refused[:MAX_SHOWN_SPANS]]
         refused += ["..."] if len(self.refused) > MAX_SHOWN_SPANS else []
         because = f" ({'; '.join([*self.reasons, *refused])})" if self.reasons or refused else ""
-        cause = ""
+        cause = f" Likely cause: {self.cause}." if self.cause else ""
         if self.asks is not None:
             from_s, to_s, why = self.asks
-            cause = f" From {from_s:.1f} s to {to_s:.1f} s {why}: a user fix or a hint there would help."
-        cause += f" Likely cause: {self.cause}." if self.cause else ""
+            cause = f" From {from_s:.1f} s to {to_s:.1f} s {why}: a user fix or a hint there would help.{cause}"
         if not self.spans or self.share == 1.0:
             return f"{self.label.capitalize()}{because}.{cause}"
         names = self.files or (("", ""),) * len(self.spans)
