@@ -280,15 +280,15 @@ class FilterState:
         if not self.has_height:
             return self._image_amsl(p, scale, sigma)
         drift_m = float(WALK_SIGMAS[HEIGHT] * np.sqrt(frame.t_s - self.began_s))
-        by_barometer = self.graph.state(frame.node)
+        node = self.graph.state(frame.node)
         if self.terrain.has_dem:
             amsl_m, sigma_m = self._image_amsl(p, scale, sigma)
-            seen_m = by_barometer.barometric_up_m - self.terrain.elevation_m(p)
-            stretched_m = float(np.expm1(by_barometer.calibration[LOG_HEIGHT_SCALE])) * seen_m
-            apart_m = by_barometer.barometric_up_m + stretched_m - amsl_m
+            ground_m = self.terrain.elevation_m(p)
+            reading_m = float(np.exp(node.calibration[LOG_HEIGHT_SCALE])) * (node.barometric_up_m - ground_m)
+            apart_m = ground_m + reading_m - amsl_m
             beyond_m2 = max(apart_m**2 - self.origin.agl_sigma_m**2 - drift_m**2, 0.0)
             return amsl_m, math.hypot(sigma_m, math.sqrt(beyond_m2))
-        seen_m = by_barometer.barometric_up_m - self.terrain.ground_m
+        seen_m = node.barometric_up_m - self.terrain.ground_m
         sigma_m = math.hypot(self.origin.agl_sigma_m, drift_m, sigma * seen_m)
         return self.terrain.ground_m + scale * seen_m, sigma_m
 

@@ -62,7 +62,7 @@ class LiveRun:
     status: Status
     waiting: OrderedDict[int, list[Message]] = field(default_factory=OrderedDict)
     frames: int = 0
-    has_start: bool = False  # the record has told where it begins
+    has_start: bool = False  # the record says where it begins
 
 
 def run_to_follow(bus: str) -> RunDir | None:

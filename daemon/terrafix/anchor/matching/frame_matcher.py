@@ -316,8 +316,9 @@ class FrameMatcher:
         if fix.pnp.fit is None:
             return fix
         finer = self._patch_fix(self.gradients, image, view_of_fix(view, fix), SEARCH_RADIUS, INLIER_THRESHOLD)
-        accepted = finer is not None and finer.pnp.verdict is Verdict.ACCEPTED
-        return replace(finer, refined=True) if finer is not None and accepted else fix
+        if finer is None or finer.pnp.verdict is not Verdict.ACCEPTED:
+            return fix
+        return replace(finer, refined=True)
 
     def _patch_fix(
         self, describer: Describer, image: Image, view: View, radius_share: float, threshold: float
