@@ -283,9 +283,9 @@ class FilterState:
         node = self.graph.state(frame.node)
         if self.terrain.has_dem:
             amsl_m, sigma_m = self._image_amsl(p, scale, sigma)
-            ground_m = self.terrain.elevation_m(p)
-            reading_m = float(np.exp(node.calibration[LOG_HEIGHT_SCALE])) * (node.barometric_up_m - ground_m)
-            apart_m = ground_m + reading_m - amsl_m
+            seen_m = node.barometric_up_m - self.terrain.elevation_m(p)
+            stretched_m = float(np.expm1(node.calibration[LOG_HEIGHT_SCALE])) * seen_m
+            apart_m = node.barometric_up_m + stretched_m - amsl_m
             beyond_m2 = max(apart_m**2 - self.origin.agl_sigma_m**2 - drift_m**2, 0.0)
             return amsl_m, math.hypot(sigma_m, math.sqrt(beyond_m2))
         seen_m = node.barometric_up_m - self.terrain.ground_m
