@@ -14,6 +14,8 @@ RELIEF_WAVES_M = (300.0, 3000.0)
 # and that is a lower bound: errors that both dates share, as of the elevation model, do not show. So the warp of a map
 # that states a large error is scaled in proportion, as the estimator has to expect.
 WARP_M, WARP_SHARE, WARP_WAVES_M = 0.8, 0.33, (200.0, 700.0)
+# Shadows displace what stands above the ground (docs/integrity.md#light): 1-sigma, east and north, of a frame's mean.
+SHADOW_M = np.array([0.98, 0.60])
 # Residuals of map matches after the pose, on real flights: 0.5 % of the height in each coordinate. Four fifths of it
 # repeat when the same ground is observed half a second later; uncorrelated beyond a tenth of the height.
 DETAIL_M, DETAIL_WAVES_M = 0.35, (25.0, 60.0)
@@ -100,7 +102,7 @@ class Terrain:
 
 
 class MapError:
-    """Mapped less true position: a constant offset, a smooth warp, and fine detail."""
+    """Mapped less true position: a constant offset, a smooth warp, shadows, and fine detail."""
 
     def __init__(self, seed: int, offset_m: np.ndarray, sigma_m: float) -> None:
         """``offset_m`` (2,): the constant registration error of the map; ``sigma_m``: the 1-sigma per axis that
@@ -110,10 +112,11 @@ class MapError:
         self._warp_m = max(WARP_M, WARP_SHARE * sigma_m)
         self._warp = (_Waves(rng, WARP_WAVES_M), _Waves(rng, WARP_WAVES_M))
         self._detail = (_Waves(rng, DETAIL_WAVES_M), _Waves(rng, DETAIL_WAVES_M))
+        self._shadow = (_Waves(rng, SETTLED_WAVES_M, 8), _Waves(rng, SETTLED_WAVES_M, 8))
 
     def at(self, places_m: np.ndarray) -> np.ndarray:
         """(N, 2) -> (N, 2) metres."""
-        fields = [
-            self._warp_m * w(places_m) + DETAIL_M * d(places_m) for w, d in zip(self._warp, self._detail, strict=True)
-        ]
-        return self.offset_m + np.stack(fields, 1)
+        warp, detail, shadow = (
+            np.stack([field(places_m) for field in fields], 1) for fields in (self._warp, self._detail, self._shadow)
+        )
+        return self.offset_m + self._warp_m * warp + DETAIL_M * detail + SHADOW_M * shadow
