@@ -51,7 +51,7 @@ from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODE
 from terrafix.core.camera import CameraCalibration, Readout
 from terrafix.core.gate import SIGMAS_95
 from terrafix.core.geodesy import LocalFrame, rot_from_quat
-from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.core.initial_position import SEARCH_START_SIGMA_M, START_WINDOW_MAX_M, START_WINDOW_SIGMAS
 from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget
@@ -74,7 +74,7 @@ NEW_GROUND_SHARE = 0.35  # share of the footprint: motion after which an observa
 MIN_OBSERVATION_WEIGHT = 0.08  # weight of another observation of the same ground [tuned]
 # A start coordinate that is wrong by far more than its 1-sigma: its probability (the belief's uniform share), and the
 # window that the belief keeps for it until a pose confirms the position, in sigmas and at most in metres. [tuned]
-START_UNIFORM_SHARE, START_WINDOW_SIGMAS, START_WINDOW_MAX_M = float(np.exp(-START_LOG_ODDS)), 8.0, 500.0
+START_UNIFORM_SHARE = float(np.exp(-START_LOG_ODDS))
 # 1-sigma, metres: the apparent position also contains the tilt error, which is not known at the start [tuned]
 START_SIGMA_FLOOR_M = 8.0
 # Radians, upper bound of the process noise by tilt: the belief follows the position from which the image seems to be

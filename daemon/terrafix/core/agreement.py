@@ -18,6 +18,7 @@ from terrafix.core.gate import MIN_COMPONENT_WEIGHT
 class Cause(StrEnum):
     ELSEWHERE = "elsewhere"  # the vehicle is at another place of this map
     OTHER_GROUND = "other ground"  # the map does not show the ground below
+    START = "start"  # the start coordinate is wrong by far more than it claims, and no map match has placed the flight
     DESCRIPTION = "description"  # heading, height, focal length, mount or map: what no other monitor names
 
 
@@ -40,16 +41,17 @@ P_NOTHING, P_NOTHING_DESCRIPTION = 0.2, 0.99
 PATTERN_HEIGHTS = 5.0
 
 # Rows: for a unit of new ground, which for ELSEWHERE is one height above ground, for OTHER_GROUND the share of the pose
-# that is independent of those before (correlated_fixes.py), for DESCRIPTION one correlation over other ground than the
-# one before. Correlations without a pose do not count for OTHER_GROUND: over bare ground they are frequent as well.
+# that is independent of those before (correlated_fixes.py), for START and DESCRIPTION one correlation over other ground
+# than before. Correlations without a pose do not count for OTHER_GROUND: over bare ground they are frequent as well.
 NATS: dict[Observed, dict[Cause, float]] = {
     Observed.POSE: {
         Cause.ELSEWHERE: -1.0 / PATTERN_HEIGHTS,
         Cause.OTHER_GROUND: math.log((1.0 - P_REJECTED_OTHER_GROUND) / (1.0 - P_REJECTED)),
+        Cause.START: -math.inf,  # from then on the map has the position
         Cause.DESCRIPTION: math.log((1.0 - P_NOTHING_DESCRIPTION) / (1.0 - P_NOTHING)),
     },
     Observed.REJECTED: {Cause.OTHER_GROUND: math.log(P_REJECTED_OTHER_GROUND / P_REJECTED)},
-    Observed.NOTHING: {Cause.DESCRIPTION: math.log(P_NOTHING_DESCRIPTION / P_NOTHING)},
+    Observed.NOTHING: dict.fromkeys((Cause.START, Cause.DESCRIPTION), math.log(P_NOTHING_DESCRIPTION / P_NOTHING)),
 }
 
 
@@ -69,6 +71,8 @@ RANGES: dict[Cause, Range] = {
     Cause.ELSEWHERE: Range(-math.inf, -math.inf, 0.0),
     # A map that was right for a kilometre can still end. [tuned]
     Cause.OTHER_GROUND: Range(-6.0, -6.0, 4.0),
+    # People state a start as they state a description. A receiver may have been spoofed. [tuned]
+    Cause.START: Range(math.log(0.05 / 0.95), -math.log(100_000.0), math.log(3600.0 * 1000.0), settles=True),
     # One description in twenty is wrong, and none of it changes in flight. Upper limit: 3600 correlations an hour, one
     # false alarm in 1000 hours. [tuned]
     Cause.DESCRIPTION: Range(math.log(0.05 / 0.95), -math.log(100_000.0), math.log(3600.0 * 1000.0), settles=True),

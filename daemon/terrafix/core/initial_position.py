@@ -12,6 +12,8 @@ from terrafix.messages import InitialPosition, Origin
 
 # 1-sigma per axis: the map is searched for an initial position that is less certain than this.
 SEARCH_START_SIGMA_M = 100.0
+# A start that is wrong lies evenly over so many of its 1-sigma about it, at most so far away. [tuned]
+START_WINDOW_SIGMAS, START_WINDOW_MAX_M = 8.0, 500.0
 
 Bounds = tuple[float, float, float, float]  # west, south, east, north [deg]
 

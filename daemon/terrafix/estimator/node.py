@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
+from terrafix.core.agreement import Cause
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
@@ -211,6 +212,8 @@ class EstimatorNode:
         assert self._axes is not None and self._monitors is not None
         self._estimator = estimator
         estimator.hypotheses.use(self._monitors.agreement)
+        if self._is_placed_by_map:
+            self._monitors.agreement.begin(Cause.START, -math.inf)
         self._flight = EstimatedFlight(estimator, self._axes, time_offset, self._monitors, self._telemetry)
         return estimator
 

@@ -4,13 +4,14 @@ be otherwise by each cause of core/agreement.py. What the anchor adds ("anywhere
 The heaviest component is published, with the second moments of the mixture about it. The mean of two separate places
 would be neither of them (Gaussian sum filter: Alspach and Sorenson 1972)."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from terrafix.core.agreement import Agreement, Cause
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
-from terrafix.core.initial_position import SEARCH_START_SIGMA_M
+from terrafix.core.initial_position import SEARCH_START_SIGMA_M, START_WINDOW_MAX_M, START_WINDOW_SIGMAS
 from terrafix.core.pose import positive_part
 from terrafix.estimator.integrity.alternative_position import AlternativePosition
 from terrafix.estimator.integrity.other_ground import OtherGround
@@ -48,8 +49,10 @@ class PositionHypotheses:
     def __init__(self, origin: Origin | None = None) -> None:
         """``origin``: of a new flight. The uncertainty of a start that has to be searched for is held here and not in
         the graph's prior, which would make the graph ill-conditioned."""
-        searched = origin is not None and origin.start_sigma_m > SEARCH_START_SIGMA_M
-        self._start_sigma_m = origin.start_sigma_m if origin is not None and searched else 0.0
+        stated_m = 0.0 if origin is None else origin.start_sigma_m
+        self._start_sigma_m = stated_m if stated_m > SEARCH_START_SIGMA_M else 0.0
+        # 1-sigma per axis of a start that is wrong, of a uniform distribution
+        self._start_error_m = min(START_WINDOW_SIGMAS * stated_m, START_WINDOW_MAX_M) / math.sqrt(3.0)
         self.anywhere_m = 0.0
         self.use(Agreement())
         self._modes: tuple[Component, ...] = ()  # of the anchor's belief, heaviest first
@@ -66,7 +69,7 @@ class PositionHypotheses:
     def is_multimodal(self) -> bool:
         """Whether the published position may differ from the estimate, or its covariance is inflated by the map."""
         multimodal = bool(self._modes) or self._belief is not None
-        return multimodal or any(self._agreement.weight(cause) > 0.0 for cause in (Cause.ELSEWHERE, Cause.OTHER_GROUND))
+        return multimodal or any(self._agreement.weight(cause) > 0.0 for cause in set(Cause) - {Cause.DESCRIPTION})
 
     def on_match(self, verdict: Verdict, search: SearchResult) -> str:
         """-> detail of the verdict on a match that is LOST; empty for any other."""
@@ -95,6 +98,7 @@ class PositionHypotheses:
     def on_match_accepted(self) -> None:
         """A map match agreed with the estimate."""
         self._start_sigma_m, self._modes, self._belief = 0.0, (), None
+        self._agreement.begin(Cause.START, -math.inf)
 
     def on_relocalized(self) -> None:
         """What matches said before does not count: a search over several frames has found the position, or they were
@@ -118,6 +122,7 @@ class PositionHypotheses:
         cov[:2, 2:] *= right * own_weight
         cov[2:, :2] *= right * own_weight
         wrong_m2 = self._agreement.weight(Cause.DESCRIPTION) * path_error_m**2 + self.other_ground.variance_m2
+        wrong_m2 += self._agreement.weight(Cause.START) * self._start_error_m**2
         anywhere_m2 = max(self.anywhere_m, self._start_sigma_m) ** 2
         cov[:2, :2] = right * moments_m2 + self.other.moments_m2() + (wrong_m2 + anywhere_m2) * np.eye(2)
         return offset_m, cov

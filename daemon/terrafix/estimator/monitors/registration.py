@@ -1,6 +1,7 @@
-"""Whether the map has confirmed the description of the flight (``Cause.DESCRIPTION``), from the success of correlations
-over new ground: Wald's SPRT of "the description is right" against "something in it that no other monitor names is
-wrong, so that the matcher finds no place". Once confirmed the test ends: none of these changes in flight."""
+"""Whether the map has confirmed the start (``Cause.START``) and the description (``Cause.DESCRIPTION``) of the flight,
+from the success of correlations over new ground: Wald's SPRT of "the description is right" against "something in it
+that no other monitor names is wrong, so that the matcher finds no place". Once confirmed the test ends: none of these
+changes in flight."""
 
 import math
 
@@ -39,6 +40,7 @@ class Registration:
         if self._heights < REGISTRATION_SPACING_HEIGHTS:
             return
         self._heights = 0.0
-        self._agreement.observe(Observed.POSE if found else Observed.NOTHING, Cause.DESCRIPTION)
+        for cause in (Cause.START, Cause.DESCRIPTION):
+            self._agreement.observe(Observed.POSE if found else Observed.NOTHING, cause)
         log_odds = self._agreement.log_odds[Cause.DESCRIPTION]
         self.active = log_odds >= RANGES[Cause.DESCRIPTION].most or (self.active and log_odds > 0.0)

@@ -295,6 +295,32 @@ def test_the_leading_mode_is_published_while_the_graph_has_no_pose() -> None:
     assert 80.0 < sigma_m(run.estimate(11)) < 250.0
 
 
+def flown_without_a_pose(start_sigma_m: float, frames: int) -> tuple[Flight, EstimatorRun]:
+    """Textured ground is correlated with the map in each frame from the start on, and no pose is found."""
+    flight, run = Flight(frames + 2, seed=3), EstimatorRun()
+    run.feed([msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m)])
+    for i in range(frames):
+        run.feed(with_map(flight, i, msgspec.structs.replace(flight.fix(i), verdict=Verdict.FEW_INLIERS, pose=None)))
+    return flight, run
+
+
+@pytest.mark.parametrize(("start_sigma_m", "away_m"), [(20.0, 160.0), (90.0, 500.0)])
+def test_a_start_where_correlations_find_no_pose_may_be_as_wrong_as_eight_of_its_sigmas(
+    start_sigma_m: float, away_m: float
+) -> None:
+    _, run = flown_without_a_pose(start_sigma_m, 6)
+    first, last = sigma_m(run.estimate(0)), sigma_m(run.estimate(5))
+    wrong = (last**2 - first**2) / (away_m**2 / 3.0)  # probability, of a uniform distribution
+    assert 0.1 < wrong < 0.75
+
+
+def test_the_first_pose_on_the_map_ends_the_doubt_about_the_start() -> None:
+    flight, run = flown_without_a_pose(20.0, 6)
+    for i in (6, 7):
+        run.feed(with_map(flight, i, flight.fix(i)))
+    assert sigma_m(run.estimate(7)) < 15.0
+
+
 def test_a_lost_sigma_of_an_ambiguous_match_inflates_the_covariance_before_the_place_is_lost() -> None:
     flight = Flight(30, seed=3)
     run = EstimatorRun().fly(flight, 0, 20)

@@ -216,7 +216,10 @@ def _attempts(monitor: Registration, count: int, *, found: bool) -> None:
 
 @pytest.fixture
 def agreement() -> Agreement:
-    return Agreement()
+    """Of a flight whose start is not in question."""
+    found = Agreement()
+    found.begin(Cause.START, -math.inf)
+    return found
 
 
 @pytest.fixture
