@@ -1,5 +1,6 @@
 """Small nodes for the tests of shell and supervisor. Child processes import this module by name (see ``TABLE``)."""
 
+import contextlib
 import os
 import threading
 from collections.abc import Iterable
@@ -177,3 +178,12 @@ TABLE: tuple[Process, ...] = (
     ),
     replace(_BASE, name="vision", publishes=(m.Origin, m.Frame, m.SourceEnded)),
 )
+
+
+def children_of(pid: int) -> dict[str, int]:
+    """Process name as in `ps` -> pid; the fork server has the name of the interpreter."""
+    pids = {}
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        with contextlib.suppress(FileNotFoundError):  # ended meanwhile
+            pids[Path(f"/proc/{child}/comm").read_text().strip()] = int(child)
+    return pids

@@ -1,9 +1,12 @@
 """The soak test: slopes, and what counts as growth."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from terrafix_lab.bench.soak import Samples, grows, growth, slope_per_h
+from flight_records import gps_input, live_messages, write_record
+from terrafix_lab.bench.soak import Samples, grows, growth, output_of, slope_per_h
 
 
 def samples(mb_per_h: float, *, files: int = 0, away: bool = False) -> Samples:
@@ -49,3 +52,12 @@ def test_caches_that_fill_in_the_first_half_are_no_growth_and_what_grows_in_the_
     late.memory_mb["vision"] = (np.array(late.memory_mb["vision"]) + np.maximum(t_s - 3600.0, 0.0) / 900.0).tolist()
     assert grows(growth(filling)) == []
     assert grows(growth(late)) == ["memory by 2.5 % an hour"]
+
+
+def test_the_output_of_a_record_has_its_rate_and_how_often_the_fix_was_lost(tmp_path: Path) -> None:
+    write_record(tmp_path / "flight.mcap", live_messages(20))
+    found = output_of(tmp_path / "flight.mcap")
+    assert found["frames_per_s"] == pytest.approx(19 / 9.0) and found["changes_per_min"] == 0.0
+    lost = [m for m in live_messages(20) if getattr(m, "t_ns", 0) < 4e9 or not hasattr(m, "no_fix_reason")]
+    write_record(tmp_path / "flight.mcap", [*lost, gps_input(5_000_000_000, 1), gps_input(6_000_000_000)])
+    assert output_of(tmp_path / "flight.mcap")["changes_per_min"] == pytest.approx(20.0)

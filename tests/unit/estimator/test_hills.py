@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from seeds import seeds
 from simulated_flight import EstimatorRun, Flight, cov_of, error_m, without_fix
 from terrafix.estimator.models.terrain_roughness import ROUGHNESS_CANDIDATES, TerrainRoughness
 
@@ -38,7 +39,7 @@ def test_height_above_ground_is_visual_and_amsl_height_is_barometric(run: tuple[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", seeds(1, 3))
 def test_height_without_map_matches_does_not_drift_down(seed: int) -> None:
     """Two minutes of odometry alone: factors in metres pulled the camera down to half of its height, with a sigma of
     8 %."""
@@ -53,7 +54,7 @@ def test_height_without_map_matches_does_not_drift_down(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", seeds(2, 3))
 def test_hard_braking_without_imu_does_not_change_the_height(seed: int) -> None:
     """From 12 m/s to zero within a frame and off again, every ten seconds, without IMU. Gaussian increments kept the
     cruise velocity and changed the height instead, which scales the odometry: errors were twice as large."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from map_matches import plane, with_search
+from seeds import seeds
 from simulated_flight import (
     ORIGIN,
     EstimatorRun,
@@ -56,7 +57,7 @@ def test_the_same_odd_order_gives_the_same_bytes() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", seeds(1, 2, 3))
 def test_late_matches_are_worth_as_much_as_those_in_time(seed: int) -> None:
     """Once they have arrived: within a fifth of what both claim, and the claims within a tenth."""
     flight, frames = Flight(90, seed=seed, fix_every=3), 90

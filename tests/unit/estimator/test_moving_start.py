@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from inertial_flight import ORIGIN
+from seeds import seeds
 from simulated_flight import CAMERA, EstimatorRun, cov_of
 from terrafix.core.camera import Mount
 from terrafix.core.geodesy import rot_w_b
@@ -78,7 +79,7 @@ def starts_of(run: EstimatorRun) -> list[CalibrationFault]:
     return [m for m in run.published if isinstance(m, CalibrationFault) and m.quantity == "start"]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", seeds(1, 2, 3))
 def test_a_start_on_a_deck_that_moves_is_no_place_once_the_ground_is_seen_to_move(seed: int) -> None:
     run = taken_off(seed, 6.0, 21.0)
     estimate = run.estimates()[-1]
@@ -94,7 +95,7 @@ def test_the_map_places_a_flight_that_began_on_a_deck() -> None:
     assert [fault.active for fault in starts_of(run)] == [True, False]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", seeds(1, 2, 3, 4))
 def test_a_take_off_from_the_ground_stays_placed(seed: int) -> None:
     run = taken_off(seed, 0.0, 21.0)
     assert all(m.source_label is not SourceLabel.NOT_PLACED for m in run.published if isinstance(m, NavEstimate))

@@ -6,6 +6,7 @@ import pytest
 
 from inertial_flight import InertialFlight
 from overloaded_flight import FRAME_EVERY, FRAME_S, LateStamps, Load, fly, sigma_m
+from seeds import seeds
 from terrafix.messages import Verdict
 
 SECONDS, SETTLED_S = 30, 8.0  # of flight; until the place of a plane that began in the air is known
@@ -43,7 +44,7 @@ def test_lost_odometry_is_unknown_motion_and_the_map_is_believed_after_it(plane:
     assert len(flown.maps(SETTLED_S)) >= 10 and set(flown.maps(SETTLED_S)) == {Verdict.ACCEPTED}
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", seeds(3, 4))
 def test_right_matches_are_believed_though_attitudes_came_late_at_the_start(seed: int) -> None:
     """An attitude of 0.8 s before, taken for that of the frame, put the tilt of then into the mount, and the matches
     after it were rejected, some for as long as the plane flew."""
@@ -62,7 +63,7 @@ BEGIN_S, END_S = 16.0, 22.0  # of stamps that get later
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", seeds(1, 4))
 def test_a_plane_is_found_again_after_stamps_that_got_later(seed: int) -> None:
     """When the stamps are right again the estimate is 25 m behind and 4 m/s too slow. Each right match was then farther
     from it than the one before, so that no two seemed to agree, and all were rejected to the end of the flight."""
@@ -76,7 +77,7 @@ def test_a_plane_is_found_again_after_stamps_that_got_later(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", seeds(1, 4))
 def test_odometry_to_one_side_of_the_prediction_is_a_wrong_velocity_before_a_match_is_rejected(seed: int) -> None:
     """Stamps that get later, and faster so: no image is far from the prediction, and each one is behind it."""
     flown = fly(LateStamps(seed, 22, lambda s: 0.05 * s**2, BEGIN_S, END_S), Load())
@@ -86,7 +87,7 @@ def test_odometry_to_one_side_of_the_prediction_is_a_wrong_velocity_before_a_mat
     assert not rejected or first.t_ns <= min(rejected)
 
 
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", seeds(1, 4))
 def test_matches_that_all_come_after_their_frame_has_left_the_window_place_a_plane(seed: int) -> None:
     """The anchor works on each for 6 s: with ten runnable processes for each core it took 14, all matches were stale,
     and nothing placed the plane as long as it flew."""

@@ -11,6 +11,7 @@ import pytest
 from inertial_flight import ORIGIN, InertialFlight
 from overloaded_flight import FRAME_EVERY, FRAME_S, sigma_m
 from overloaded_flight import OverloadedResult as LoadedFlown
+from seeds import seeds
 from simulated_flight import PLACE, EstimatorRun
 from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
@@ -144,7 +145,7 @@ def seen_as(orientation: Orientation) -> Change:
     return lambda odometry, _: with_pairs(odometry, np.array(odometry.two_view).reshape(-1, 2) @ inverse.T)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", seeds(1, 2))
 def test_a_frozen_picture_that_jitters_is_stalled_and_its_place_on_the_map_is_not_taken(seed: int) -> None:
     result = flown(seed, frozen_with_jitter, lambda _: FIRST)
     assert not result.lies()
@@ -200,7 +201,7 @@ def twice_as_fast(odometry: Odometry, _: np.random.Generator) -> Odometry:
     return with_pairs(odometry, pairs)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", seeds(1, 2))
 def test_images_that_contradict_inertial_readings_for_long_are_not_believed_for_that(seed: int) -> None:
     """The graph is reset, as wide as all of that time allows, and only a place ties images to it again."""
     result = flown(seed, twice_as_fast, lambda _: None)
@@ -220,7 +221,7 @@ def squeezed(odometry: Odometry, _: np.random.Generator) -> Odometry:
     return with_pairs(odometry, np.array(odometry.two_view) * (1.0, 4.0 / 3.0, 1.0, 4.0 / 3.0))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", seeds(1, 2))
 def test_images_that_are_squeezed_in_flight_contradict_inertial_readings(seed: int) -> None:
     """Each motion alone passes the innovation gate."""
     result = flown(seed, squeezed, lambda _: None)

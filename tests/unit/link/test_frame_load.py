@@ -25,7 +25,7 @@ def texts_of(left_out: list[bool], error: str = OVERTAKEN) -> list[str]:
 def test_a_computer_that_leaves_out_most_frames_is_reported_once_and_so_is_its_recovery() -> None:
     slow, fast = [i % 4 != 0 for i in range(60)], [False] * 60
     assert texts_of(fast + slow + fast) == [
-        "Terrafix: computer too slow: 6 of 10 frames out",
+        "Terrafix: computer too slow: 0.8 of 2.0 Hz",
         "Terrafix: computer keeps up again",
     ]
 

@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from runtime_nodes import TABLE
+from runtime_nodes import TABLE, children_of
 from terrafix import messages as m
 from terrafix.core.config import Config, SmootherSection
 from terrafix.core.errors import ConfigError, MapError, OutputError
@@ -228,15 +228,6 @@ def supervisor_process(out_dir: Path, **environment: str) -> Iterator[subprocess
             yield process
         finally:
             process.kill()
-
-
-def children_of(pid: int) -> dict[str, int]:
-    """Process name as in `ps` -> pid; the fork server has the name of the interpreter."""
-    pids = {}
-    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        with contextlib.suppress(FileNotFoundError):  # ended meanwhile
-            pids[Path(f"/proc/{child}/comm").read_text().strip()] = int(child)
-    return pids
 
 
 def started(process: "subprocess.Popen[str]") -> dict[str, int]:

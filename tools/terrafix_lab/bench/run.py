@@ -24,6 +24,7 @@ from terrafix_lab.bench import kernels as bench_kernels
 from terrafix_lab.bench import micro as bench_micro
 from terrafix_lab.bench import peers as bench_peers
 from terrafix_lab.bench import scaling
+from terrafix_lab.bench.comparison import percent_text, spread_text
 from terrafix_lab.bench.page import comparison_table, stage_table, write_page
 from terrafix_lab.sim.flights.folder import FRAME_HZ, plan_flight, write_flight
 from terrafix_lab.sim.world import place as world
@@ -195,11 +196,11 @@ def _show(result: dict[str, Any], out: Path) -> None:
             table.add_column(kind, justify="right")
         for title, key in (("time by the baseline's", "frame_ms"), ("processor time likewise", "cpu_ms")):
             table.add_row(title, *(_times(flight["ratios"][kind][key]) for kind in runs), "1", style="bold")
-        for title, key in (("frame, ms (median / p95)", "frame_ms"), ("processor, ms", "cpu_ms")):
-            table.add_row(title, *(_pair(r[key]) for r in (*runs.values(), baseline)))
+        for title, key in (("frame, ms (median/p95/p99)", "frame_ms"), ("processor, ms", "cpu_ms")):
+            table.add_row(title, *(spread_text(r[key]) for r in (*runs.values(), baseline)))
         table.add_row("first frame, ms", *(f"{r['first_frame_ms']:.0f}" for r in runs.values()), "")
         for key in ("within_20m", "within_50m"):
-            cells = [_percent(r["accuracy"][key]) for r in (*runs.values(), baseline)]
+            cells = [percent_text(r["accuracy"][key]) for r in (*runs.values(), baseline)]
             table.add_row(key.replace("_", " ").replace("m", " m"), *cells)
         cells = ["-" if (v := r["accuracy"]["median_m"]) is None else f"{v:.1f} m" for r in (*runs.values(), baseline)]
         table.add_row("median error", *cells)
@@ -217,21 +218,13 @@ def _show(result: dict[str, Any], out: Path) -> None:
     micro = {part: times for part, times in result["micro"].items() if isinstance(times, dict)}
     table = Table(title=f"parts, on {result['micro']['flight']}", title_justify="left")
     table.add_column("")
-    table.add_column("ms (median / p95)", justify="right")
+    table.add_column("ms (median/p95/p99)", justify="right")
     for part, times in micro.items():
-        table.add_row(part, _pair(times))
+        table.add_row(part, spread_text(times))
     console.print(table)
     if "growth" in result:
         scaling.show(result["growth"], console)
     typer.echo(f"written to {out}")
-
-
-def _pair(times: dict[str, float] | None) -> str:
-    return f"{times['median']:.1f} / {times['p95']:.1f}" if times else "-"
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
 
 
 def _times(ratio: float | None) -> str:

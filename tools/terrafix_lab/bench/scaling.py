@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from terrafix_lab.bench import photos, rendering
+from terrafix_lab.bench import photos
 from terrafix_lab.bench.growth import estimator_cost, map_size, merging
 
 AREAS_KM2 = (1.0, 10.0, 100.0)
@@ -24,8 +24,8 @@ def measure(
     areas_km2: tuple[float, ...] = AREAS_KM2,
     flights_frames: tuple[int, ...] = FLIGHTS_FRAMES,
 ) -> dict[str, Any]:
-    """-> "map": one entry per area, "flight": one per length, "merge": of the submaps of a flight, "render": one frame
-    of the simulator, "photos": first position of photos of 26 megapixels."""
+    """-> "map": one entry per area, "flight": one per length, "merge": of the submaps of a flight, "photos": first
+    position of photos of 26 megapixels."""
     maps, flights = [], []
     for area_km2 in areas_km2:
         folder = work / f"map-{area_km2:g}"
@@ -40,11 +40,9 @@ def measure(
             flights.append(_run(estimator_cost.__name__, str(frames), out=work / f"flight-{frames}.json"))
     with console.status(f"a merge of {MERGED_KEYFRAMES} keyframes"):
         merged = _run(merging.__name__, str(MERGED_KEYFRAMES), out=work / "merging.json")
-    with console.status("frames of the simulator"):
-        rendered = _run(rendering.__name__, out=work / "render.json")
     with console.status("photos of 26 megapixels"):
         large = _run(photos.__name__, out=work / "photos.json")
-    return {"map": maps, "flight": flights, "merge": merged, "render": rendered, "photos": large}
+    return {"map": maps, "flight": flights, "merge": merged, "photos": large}
 
 
 def map_table(grown: dict[str, Any]) -> list[list[str]]:
@@ -87,13 +85,10 @@ def flight_table(grown: dict[str, Any]) -> list[list[str]]:
 
 
 def show(grown: dict[str, Any], console: Console) -> None:
-    """Prints tables: map, flight, merge; and lines: rendering, photos. Times are processor times if not marked."""
+    """Prints tables: map, flight, merge; and a line: photos. Times are processor times if not marked."""
     console.print(side_by_side("as the map grows (processor time)", map_table(grown)))
     console.print(side_by_side("as the flight grows (processor time, estimator alone)", flight_table(grown)))
     merging.show(grown["merge"], console)
-    one = grown["render"]
-    size = f"{one['width_px']}x{one['height_px']}"
-    console.print(f"a simulated frame of {size}: {one['cpu_ms']['median']:.0f} ms of processor time", highlight=False)
     one = grown["photos"]
     size, first_s, memory_mb = f"{one['width_px']}x{one['height_px']}", one["first_position_s"], one["peak_memory_mb"]
     console.print(

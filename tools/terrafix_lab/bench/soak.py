@@ -1,17 +1,22 @@
-"""Soak test: hours of flight at real rates by the real processes; does anything grow?
+"""Soak test: hours of flight at real rates by the real processes; does anything grow? And what other programs cost.
 
-python -m terrafix_lab.bench.soak OUT [--minutes M] [--seed N] [--fault NAME] [--json FILE]
+python -m terrafix_lab.bench.soak OUT [--minutes M] [--seed N] [--fault NAME] [--busy N ...] [--json FILE]
 
 A copter flies the two legs of the fault matrix forth and back, without end: camera and simulated autopilot as in
 `terrafix chaos`. Once in SAMPLE_S memory and open files of each process are read; the delay from image to estimate and
 the gaps of GPS_INPUT are those of the record. Slopes are over the second half of the time: in the first, windows
 and caches fill (docs/jetson.md has their bounds). Exit code 1: memory of all processes grows by more than 1 % an hour
-and more than its own scatter (2 sigma), or open files grow; with --fault also if AC-14 is not met."""
+and more than its own scatter (2 sigma), or open files grow; with --fault also if AC-14 is not met.
+
+With --busy there is a flight beside each number of busy processes, and a table instead: frames with an estimate, age of
+their images, share of GPS_INPUT with a fix, changes between fix and none a minute, and wrong positions (chaos/verdict),
+of which one makes the exit code 1."""
 
 import math
 import os
 import time
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,15 +26,16 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from terrafix.messages import NavEstimate
+from terrafix.messages import GpsInput, NavEstimate
 from terrafix.recorder.reader import read_flight
 from terrafix_lab.bench.intervals import IntervalStats, lines_of, measure
 from terrafix_lab.bench.result_file import write_result
 from terrafix_lab.chaos.rig import Rig
 from terrafix_lab.chaos.scene import ChaosScene
 from terrafix_lab.chaos.shuttle import RUN, shuttle_in
-from terrafix_lab.chaos.verdict import sigmas
+from terrafix_lab.chaos.verdict import sigmas, wrong_fixes
 from terrafix_lab.faults.fault import Process
+from terrafix_lab.faults.processes import busy as beside
 from terrafix_lab.faults.table import fault_named
 from terrafix_lab.standalone import run_standalone
 
@@ -125,8 +131,12 @@ def grows(found: dict[str, dict[str, float]]) -> list[str]:
 
 
 def output_of(record: Path) -> dict[str, Any]:
-    """Delay in the first and the last third of the flight, and the intervals of GPS_INPUT."""
+    """Delay in the first and the last third of the flight, frames with an estimate a second, intervals of GPS_INPUT,
+    and how often a minute it changed between a fix and none, from the first one on."""
     messages = [message for _, _, message in read_flight(record)]
+    has_fix = [m.fix_type >= 3 for m in messages if isinstance(m, GpsInput)]
+    has_fix = has_fix[has_fix.index(True) :] if True in has_fix else []
+    intervals = measure(messages)
     estimates = [m for m in messages if isinstance(m, NavEstimate) and m.emitted_at_ns]
     delays = [(m.t_ns / 1e9, (m.emitted_at_ns - m.t_ns) / 1e6) for m in estimates]
     times, ms = np.array(delays).T
@@ -134,7 +144,9 @@ def output_of(record: Path) -> dict[str, Any]:
     return {
         "delay_first_third_ms": float(np.median(ms[times <= cut_s[0]])),
         "delay_last_third_ms": float(np.median(ms[times >= cut_s[1]])),
-        "gps_input": msgspec.to_builtins(measure(messages)),
+        "frames_per_s": len({m.frame_id for m in estimates}) / max(float(np.ptp(times)), 1.0),
+        "changes_per_min": 60.0 * sum(a != b for a, b in pairwise(has_fix)) / max(intervals.duration_s, 1.0),
+        "gps_input": msgspec.to_builtins(intervals),
     }
 
 
@@ -155,6 +167,7 @@ def soak(scene: ChaosScene, out: Path, minutes: float, seed: int, process: Proce
     found = growth(samples)
     worst = max((sigmas(fix) for fix in fixes if fix.horizontal_m), default=math.nan)
     result = {"minutes": minutes, "starts": rig.starts, "growth": found, "grows": grows(found), "worst_sigmas": worst}
+    result |= {"wrong": len(wrong_fixes(fixes)), "load": os.getloadavg()[0]}
     return result | output_of(rig.out)
 
 
@@ -176,6 +189,18 @@ def show(result: dict[str, Any], console: Console) -> None:
     console.print("; ".join(f"{name} {value}" for name, value in shown.items()), highlight=False)
 
 
+def load_table(results: dict[int, dict[str, Any]]) -> Table:
+    """``results``: of ``soak``, by the number of busy processes."""
+    table = Table(title="beside busy processes", title_justify="left")
+    for name in ("busy", "load", "frames a second", "age of an image, p95", "fix", "changes a minute", "wrong"):
+        table.add_column(name, justify="right")
+    for number, one in results.items():
+        stats = msgspec.convert(one["gps_input"], IntervalStats)
+        figures = f"{one['frames_per_s']:.2f}", f"{stats.age_p95_ms or math.nan:.0f} ms", f"{stats.fix3_share:.0%}"
+        table.add_row(str(number), f"{one['load']:.1f}", *figures, f"{one['changes_per_min']:.1f}", str(one["wrong"]))
+    return table
+
+
 def main(
     out: Annotated[Path, typer.Argument(help="New folder; the flight in it is generated.")],
     minutes: Annotated[float, typer.Option(help="Of flight.")] = 120.0,
@@ -183,9 +208,16 @@ def main(
     fault: Annotated[
         str, typer.Option(help="Fault of the processes during all of the flight, as 'processor: saturated'.")
     ] = "none",
+    busy: Annotated[list[int] | None, typer.Option(help="Busy processes; may be given several times.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="JSON to write.")] = None,
 ) -> None:
     console = Console(width=150)
+    if busy:
+        scene = shuttle_in(out, seed)
+        results = {number: soak(scene, out / RUN / str(number), minutes, seed, beside(number)) for number in busy}
+        console.print(load_table(results))
+        write_result(json_file, {str(number): one for number, one in results.items()})
+        raise typer.Exit(1 if any(one["wrong"] for one in results.values()) else 0)
     process = fault_named(fault).process or Process()
     result = soak(shuttle_in(out, seed), out / RUN, minutes, seed, process)
     show(result, console)

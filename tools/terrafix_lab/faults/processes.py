@@ -194,9 +194,13 @@ def _alter_model(rig: "Rig") -> None:
     rig.signal("anchor", signal.SIGKILL)
 
 
-def _saturate(rig: "Rig") -> None:
-    loop = [sys.executable, "-c", "while True: pass"]
-    rig.busy += [subprocess.Popen(loop) for _ in range(2 * (os.cpu_count() or 1))]
+def busy(processes: int) -> Process:
+    """So many other programs that use the processor."""
+
+    def saturate(rig: "Rig") -> None:
+        rig.busy += [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+
+    return Process(saturate, _rest)
 
 
 def _rest(rig: "Rig") -> None:
@@ -256,7 +260,7 @@ AROUND_THEM = (
     console("kill -9", 0.0, lambda it: it.signal(signal.SIGKILL), lambda _: None),
     console("SIGSTOP", LONG_S, lambda it: it.signal(signal.SIGSTOP), lambda it: it.signal(signal.SIGCONT)),
     console(f"flooded by {EVENT_CLIENTS + ASKING_CLIENTS} clients", LONG_S, Console.flood, Console.end_flood),
-    act("processor: saturated", LONG_S, _saturate, _rest),
+    Fault("processor: saturated", lasts_s=LONG_S, process=busy(2 * (os.cpu_count() or 1))),
     Fault(
         "heat: 40 to 97 to 40 C",
         lasts_s=LONG_S,

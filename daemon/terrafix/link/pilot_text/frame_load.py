@@ -22,8 +22,9 @@ class FrameLoad:
         first frame that it left out, or ends; nothing while it lasts."""
         self._newest.append(frame)
         left_out_ns = [newest.t_ns for newest in self._newest if newest.error == OVERTAKEN]
-        slow = len(left_out_ns) > FRAMES - len(left_out_ns)
-        if not self._debounce.due(slow, frame.t_ns, clears=not slow):
+        if not self._debounce.due(slow := 2 * len(left_out_ns) > FRAMES, frame.t_ns, clears=not slow):
             return []
-        t_ns, detail = left_out_ns[0] if slow else frame.t_ns, f"{len(left_out_ns)} of {FRAMES} frames out"
+        hz = (len(self._newest) - 1) * 1e9 / max(frame.t_ns - self._newest[0].t_ns, 1)
+        detail = f"{hz * (1.0 - len(left_out_ns) / len(self._newest)):.1f} of {hz:.1f} Hz"
+        t_ns = left_out_ns[0] if slow else frame.t_ns
         return [CalibrationFault(t_ns=t_ns, quantity=TOO_SLOW, factor=None, detail=detail, active=slow)]

@@ -16,7 +16,7 @@ from textured_ground import texture
 from two_dates import TrueView, TwoDates
 
 REQUIRED, AMONG, PLACES, SEED = 0.85, 5, 80, 1
-NIGHTLY = ("adiyaman-6", "gaziantep-2")  # towns, as joplin is
+NIGHTLY = ("joplin", "adiyaman-6", "gaziantep-2")  # towns
 SETS = {
     "joplin": ("imagery/joplin/after.tif", "imagery/joplin/before.tif", 130.0),
     "adiyaman-6": ("imagery/adiyaman-6/winter.tif", "imagery/adiyaman-6/dry.tif", 90.0),

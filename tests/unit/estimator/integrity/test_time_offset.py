@@ -7,6 +7,7 @@ import pytest
 import inertial_flight
 from inertial_flight import ORIGIN as INERTIAL_ORIGIN
 from inertial_flight import InertialFlight
+from seeds import seeds
 from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of, t_ns
 from terrafix.core.camera import Mount
 from terrafix.core.gate import GATE
@@ -66,7 +67,7 @@ def offset_of(flight: InertialFlight, until_s: float = 1e9) -> TimeOffset:
     return offset
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", seeds(1, 2))
 def test_a_camera_in_time_is_not_corrected_and_not_claimed_wider(seed: int) -> None:
     offset = offset_of(InertialFlight(seed, 60, 25))
     assert offset.applied_s == 0.0 and offset.sigma_s <= STAMP_SIGMA_S
@@ -79,7 +80,7 @@ def test_an_offset_that_grows_is_followed(plane: InertialFlight) -> None:
     assert offset.applied_s > 0.3 and abs(1.2 - offset.applied_s) < 3.0 * offset.sigma_s
 
 
-@pytest.mark.parametrize("seed", [3, 8])
+@pytest.mark.parametrize("seed", seeds(3, 8))
 def test_gusts_in_straight_flight_show_a_camera_that_is_late(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     monkeypatch.setattr(inertial_flight, "course", straight_course)
     offset = offset_of(InertialFlight(seed, 70, 25, delay=lambda t_s: 1.4 * (t_s > 20.0)))

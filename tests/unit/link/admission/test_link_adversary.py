@@ -17,7 +17,7 @@ from terrafix_lab.sim.autopilot.peer import AutopilotPeer
 
 pytestmark = pytest.mark.real_time
 
-SECONDS = 4.0
+SECONDS = 2.0
 FORGED_ROLL = 0.4  # rad: 23 degrees, which displaces the optical axis on the ground by half the height
 
 

@@ -25,7 +25,7 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"GPS_INPUT stopped: no estimate for 35 s",
     r"estimator (died|stuck|gave up)",
     r"computer is (normal|hot|critical)(, -?\d+ C)?",
-    r"computer (too slow: \d+ of \d+ frames out|keeps up again)",
+    r"computer (too slow: [\d.]+ of [\d.]+ Hz|keeps up again)",
     r"telemetry of (two senders, one ignored|one sender again)",
     r"(autopilot rebooted, or its time jumps|the autopilot's time is steady again)",
     r"(attitude jumps without gyros, ignored|the attitude is steady again)",
@@ -209,7 +209,7 @@ def test_a_picture_that_turns_in_flight_is_reported_to_the_pilot_as_not_used(
 @pytest.mark.parametrize("quantity", LINK_FAULTS)
 def test_telemetry_and_frames_that_are_left_out_are_a_warning_by_their_cause(quantity: str) -> None:
     node = LinkNode(10.0)
-    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail="6 of 10 frames out", active=True)
+    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail="0.8 of 2.0 Hz", active=True)
     published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
     began, ended = (message for message in published if isinstance(message, m.StatusText))
     assert is_known(began.text) and quantity in began.text and began.severity == 4
