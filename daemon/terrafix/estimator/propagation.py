@@ -172,7 +172,7 @@ class Propagation:
             (yaws[0], yaws[1]),
             float(before.calibration[HEADING]),
             state.speed_prior.speed_mps,
-            float(np.hypot(np.radians(state.origin.attitude_sigma_deg), attitude.righted_rad)),
+            float(np.hypot(np.radians(state.origin.attitude_sigma_deg), attitude.of_vehicle.righted_rad)),
             same_source=state.continuity.last_increment_inertial is (measured is not None),
             launching=self._take_off.launching,
             velocity_observed=not fused
