@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 
 import msgspec
 import numpy as np
@@ -158,12 +158,8 @@ def test_a_gimbal_that_was_level_for_long_is_no_longer_when_its_reports_begin_to
     assert reports.opposes and not reports.is_level
 
 
-def no_report(_i: int, _state: VehicleState) -> list[GimbalAttitude]:
-    return []
-
-
-def lost(i: int, state: VehicleState) -> list[GimbalAttitude]:
-    return [held(state)] if i < 20 else []
+def lost(i: int, state: VehicleState, from_frame: int = 20) -> list[GimbalAttitude]:
+    return [held(state)] if i < from_frame else []
 
 
 def frozen(i: int, state: VehicleState) -> list[GimbalAttitude]:
@@ -190,7 +186,7 @@ def ambiguous(i: int, state: VehicleState) -> list[GimbalAttitude]:
 
 
 NAMED = {
-    **dict.fromkeys((no_report, lost), "gimbal not reported"),
+    **dict.fromkeys((partial(lost, from_frame=0), lost), "gimbal not reported"),
     frozen: "gimbal repeats a report",
     of_servos: "gimbal reports its servos",
     **dict.fromkeys((late, ambiguous), ""),
