@@ -580,6 +580,10 @@ class PoseSolution(Message, frozen=True, kw_only=True):
     pose: MapPose | None = None
 
 
+# Why the attitude of a camera on a gimbal is not the reported one: quantities of CalibrationFault
+GIMBAL_FAULTS = ("gimbal not reported", "gimbal repeats a report", "gimbal reports its servos")
+
+
 class CalibrationFault(Message, frozen=True, kw_only=True):
     """A monitor has detected a calibration fault, or its end; published on every change.
 
@@ -587,7 +591,7 @@ class CalibrationFault(Message, frozen=True, kw_only=True):
     picture", "registration" (frames match the map nowhere, for an unknown reason); and of images that are refused since
     a moment of the flight "picture upside down", "picture turned", "picture mirrored";
     "camera time" (stamps against the autopilot), "start" (the vehicle stood on what moves). Of the link, of frames and
-    telemetry that are left out: those of LINK_FAULTS in ``link/pilot_text/statustext.py``."""
+    telemetry that are left out, a gimbal included: those of LINK_FAULTS in ``link/pilot_text/statustext.py``."""
 
     quantity: str
     # scale: reported over true height; aspect ratio: scale of the image's x axis over that of y; angles: reported less

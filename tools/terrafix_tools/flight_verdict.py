@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafix.core.clock import NS_PER_S
+from terrafix.estimator.monitors.refused_pictures import DETAILS
 from terrafix.link.ground_station.prior_request import MIN_DURATION_NS, MIN_FRAMES, UNANCHORED_SHARE
 from terrafix.link.integrity.fix_type import DEGRADATION_LEVELS, MAX_HORIZONTAL_SIGMA_M
 from terrafix.link.pilot_text.statustext import LINK_FAULTS, fault_text
@@ -25,7 +26,7 @@ MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejec
 # Faults that begin in flight; all others are of the description, which was wrong from the beginning.
 BEGIN_IN_FLIGHT = ("registration", "picture upside down", "picture turned", "picture mirrored")
 # Faults whose frames or telemetry were left out: the position went on without them, at a claim of its own.
-REFUSED = ("picture frozen", "picture contradicts motion", "picture without texture", *LINK_FAULTS)
+REFUSED = (*DETAILS, *LINK_FAULTS)
 # One of map and initial position is wrong; no measurement on board decides which.
 START_CONTRADICTS_MAP = "start and map contradict each other: one of them is in the wrong place"
 MAX_SHOWN_SPANS = 3

@@ -236,7 +236,7 @@ class Initializer:
         self._prior = prior = self._prior or NavPrior.start(self._origin, t_s)
         if prior.ground is not None:
             terrain.update(prior.ground.plane, np.array(prior.ground.at_m))
-        way_m, way_sigma_m = prior.path_until(t_s, attitude.vehicle_yaw_rad)
+        way_m, way_sigma_m = prior.path_until(t_s, attitude.of_vehicle.yaw_rad)
         sigma_m = float(np.hypot(prior.sigma_m, way_sigma_m))
         rise_m = terrain.rise_sigma_m(float(np.hypot(*way_m)) + way_sigma_m)
         calibration = _calibration_at(prior, t_s, attitude, rise_m)
@@ -247,7 +247,7 @@ def _calibration_at(prior: NavPrior, t_s: float, attitude: Attitude, rise_sigma_
     """The calibration of a checkpoint, with its random walk since. None: there is none, or heading or height, which it
     refers to, are not reported now."""
     learnt = prior.learnt
-    yaw_rad = attitude.vehicle_yaw_rad
+    yaw_rad = attitude.of_vehicle.yaw_rad
     if learnt is None or prior.yaw_rad is None or yaw_rad is None or attitude.agl_m is None:
         return None
     turned_rad = math.remainder(yaw_rad - prior.yaw_rad, math.tau)

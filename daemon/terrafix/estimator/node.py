@@ -29,7 +29,7 @@ from terrafix.estimator.measurements.odometry import NO_NEW_VIEW, without_ground
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
-from terrafix.estimator.monitors.refused_pictures import RefusedPictures
+from terrafix.estimator.monitors.refused_pictures import INPUT_KINDS, RefusedInput
 from terrafix.estimator.output import (
     calibration_of,
     estimate_of,
@@ -122,7 +122,7 @@ class EstimatorNode:
         self._relocated = False  # a relocalisation has moved the estimate since
         self._monitors: Monitors | None = None
         self._rebuilds = 0  # of the graph
-        self._refused = RefusedPictures()
+        self._refused, self._gimbal_refused = RefusedInput(), RefusedInput()
         self._start_moved = False  # as reported
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
             Origin: self._on_origin,
@@ -353,6 +353,7 @@ class EstimatorNode:
             # Near the ground images move by more than their error, and on it the attitude wanders alone.
             low = frame.attitude.stands or agl_m < MIN_MATCHING_AGL_M
             untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground or low
+            untimed = untimed or bool(frame.attitude.gimbal_refused)  # what moves the image is not the vehicle alone
             jump = estimator.state.image_jump
             if estimator.state.orientation.suspects or untimed:
                 time_offset.forget_images()
@@ -362,6 +363,7 @@ class EstimatorNode:
                 time_offset.add(msgspec.structs.replace(odometry, t_ns=stamped_ns), self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
         yield from self._refused_pictures(odometry.t_ns, result.verdict, estimator.state, frame.attitude)
+        yield from self._gimbal_refused.add(odometry.t_ns, frame.attitude.gimbal_refused)
         yield from self._start_fault(estimator, odometry.t_ns)
         budget = self._claim(result.placed)
         if slow_due:
@@ -389,7 +391,7 @@ class EstimatorNode:
         if verdict is Verdict.UNCONFIRMED and not state.continuity.last_increment_inertial:
             return ()  # nothing says how the vehicle moves
         named = state.orientation.fault is not None or self._flight.time_offset.is_wrong
-        return self._refused.add(t_ns, Verdict.ACCEPTED if named else verdict)
+        return self._refused.add(t_ns, "" if named else INPUT_KINDS.get(verdict))
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved

@@ -172,7 +172,7 @@ class Propagation:
             (yaws[0], yaws[1]),
             float(before.calibration[HEADING]),
             state.speed_prior.speed_mps,
-            float(np.hypot(np.radians(state.origin.attitude_sigma_deg), attitude.righted_rad)),
+            float(np.hypot(np.radians(state.origin.attitude_sigma_deg), attitude.of_vehicle.righted_rad)),
             same_source=state.continuity.last_increment_inertial is (measured is not None),
             launching=self._take_off.launching,
             velocity_observed=not fused
@@ -287,14 +287,15 @@ class Propagation:
         return PropagationResult(odometry.verdict, placed, step_m, sigma_m, verdicts=tuple(verdicts))
 
     def _reset_height(self, registered: RegisteredFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
-        """A new graph at the reported height."""
+        """A new graph at the reported height, or at an unknown one."""
         state, predicted, p = self._state, registered.predicted, registered.p_m
         assert state.last is not None
         cov = tangent_to_world(state.last.cov, predicted.before.pose.rotation().matrix())
         cov[WORLD_POSITION, WORLD_POSITION] += predicted.cov[DELTA_P, DELTA_P]
         placed = start_at(state, predicted.frame, p[:2], worst_sigma(cov[:2, :2]))
-        below_m, reported_m = state.terrain.height_above_m(p), reported_agl_m(state, predicted.frame.attitude, p)
-        detail = f"height {below_m:.0f} m, where {reported_m:.0f} m are reported"
+        known = predicted.frame.attitude.agl_m is not None
+        other = f"{reported_agl_m(state, predicted.frame.attitude, p):.0f} m are reported" if known else "the ground is"
+        detail = f"height {state.terrain.height_above_m(p):.0f} m, where {other}"
         verdicts = [*verdicts, _reset_verdict(ResetReason.TOO_LOW, detail)]
         return _result(predicted, placed, registered.step, verdicts)
 

@@ -1,9 +1,14 @@
 """Generated flight folders for the tests of the image sources."""
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
+
+from origins import origin_of
+from terrafix.messages import Camera
 
 WIDTH, HEIGHT = 320, 240
 TOML = f"""
@@ -33,6 +38,15 @@ def picture(seed: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     rng = np.random.default_rng(seed)
     coarse = rng.integers(0, 255, (height // 8, width // 8, 3), dtype=np.uint8)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def source_of(shots: Callable[[], Iterable[object]]) -> Mock:
+    """A live camera."""
+    camera = Camera(width=WIDTH, height=HEIGHT, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
+    nothing = {"length.return_value": None, "map_hint.return_value": None, "facts.return_value": []}
+    made = Mock(live=True, **nothing, **{"origin.return_value": origin_of(camera), "name.return_value": "camera"})
+    made.shots.side_effect = lambda *_: iter(shots())
+    return made
 
 
 def jpeg(seed: int, width: int = WIDTH, height: int = HEIGHT) -> bytes:

@@ -103,6 +103,29 @@ K5, K8 = (-0.21, 0.06, 0.0004, -0.0007, -0.009), (0.31, 0.05, 0.0004, -0.0007, 0
 EQUI = (0.012, -0.004, 0.003, -0.0007)
 INTRINSICS = (561.0, 559.0, 477.5, 271.5)
 META = (-0.11, 0.03, -0.004, 0.0009, 0.0003, -0.0005)
+FRAME, META_K = {"f": 559, "cx": -2.5, "cy": 1.5}, dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), META, strict=True))
+# Model, focal lengths, further parameters in COLMAP's order, and its lens
+COLMAP = (
+    ("SIMPLE_PINHOLE", (561,), (), (X, Y)),
+    ("PINHOLE", (561, 559), (), (X, Y)),
+    ("SIMPLE_RADIAL", (561,), (-0.21,), brown(X, Y, -0.21, 0, 0, 0)),
+    ("RADIAL", (561,), (-0.21, 0.06), brown(X, Y, -0.21, 0.06, 0, 0)),
+    ("OPENCV", (561, 559), K5[:4], brown(X, Y, *K5[:4])),
+    ("FULL_OPENCV", (561, 559), K8, brown(X, Y, *K8)),
+    ("SIMPLE_RADIAL_FISHEYE", (561,), (0.012,), equidistant(X, Y, 0.012)),
+    ("RADIAL_FISHEYE", (561,), (0.012, -0.004), equidistant(X, Y, 0.012, -0.004)),
+    ("OPENCV_FISHEYE", (561, 559), EQUI, equidistant(X, Y, *EQUI)),
+)
+ONE, ALL = {"focal": 0.6}, {"focal_x": 0.6, "focal_y": 0.59, "c_x": 0.01, "c_y": -0.02}
+# opensfm/features.py: pixel = x max(w, h) + (w - 1) / 2; of ONE and of ALL
+OPENSFM_PX = (576, 576, 479.5, 269.5), (576, 566.4, 9.6 + 479.5, -19.2 + 269.5)
+OPENSFM: tuple[tuple[str, dict[str, float], dict[str, float], tuple[np.ndarray, np.ndarray]], ...] = (
+    ("perspective", ONE, {"k1": -0.21, "k2": 0.06}, brown(X, Y, -0.21, 0.06, 0, 0)),
+    ("radial", ALL, {"k1": -0.21, "k2": 0.06}, brown(X, Y, -0.21, 0.06, 0, 0)),
+    ("brown", ALL, dict(zip(("k1", "k2", "p1", "p2", "k3"), K5, strict=True)), brown(X, Y, *K5)),
+    ("fisheye", ONE, {"k1": 0.012, "k2": -0.004}, equidistant(X, Y, 0.012, -0.004)),
+    ("fisheye_opencv", ALL, dict(zip(("k1", "k2", "k3", "k4"), EQUI, strict=True)), equidistant(X, Y, *EQUI)),
+)
 # name of the file, its text, pixels of RAYS by the program's own formula, the middle of the first pixel being 0, 0
 CASES = {
     "ROS, plumb_bob": ("a.yaml", ros("plumb_bob", [*K5]), at(*INTRINSICS, brown(X, Y, *K5))),
@@ -122,57 +145,32 @@ CASES = {
     ),
     "Kalibr, radtan": ("a.yaml", kalibr("radtan", [*K5[:4]]), at(*INTRINSICS, brown(X, Y, *K5[:4]))),
     "Kalibr, equidistant": ("a.yaml", kalibr("equidistant", [*EQUI]), at(*INTRINSICS, equidistant(X, Y, *EQUI))),
-    "COLMAP, OPENCV": (
-        "cameras.txt",
-        f"# Camera list\n1 OPENCV {W} {H} 561 559 477.5 271.5 -0.21 0.06 0.0004 -0.0007\n",
-        at(*INTRINSICS, brown(X, Y, *K5[:4])) - 0.5,
-    ),
-    "COLMAP, SIMPLE_RADIAL": (
-        "cameras.txt",
-        f"1 SIMPLE_RADIAL {W} {H} 561 477.5 271.5 -0.21\n",
-        at(561, 561, 477.5, 271.5, brown(X, Y, -0.21, 0, 0, 0)) - 0.5,
-    ),
-    "COLMAP, RADIAL_FISHEYE": (
-        "cameras.txt",
-        f"1 RADIAL_FISHEYE {W} {H} 561 477.5 271.5 0.012 -0.004\n",
-        at(561, 561, 477.5, 271.5, equidistant(X, Y, 0.012, -0.004)) - 0.5,
-    ),
-    # opensfm/features.py: pixel = x max(w, h) + (w - 1) / 2
-    "OpenSfM, brown": (
-        "cameras.json",
-        opensfm(
-            "brown", focal_x=0.6, focal_y=0.59, c_x=0.01, c_y=-0.02, k1=K5[0], k2=K5[1], p1=K5[2], p2=K5[3], k3=K5[4]
-        ),
-        at(576, 566.4, 9.6 + 479.5, -19.2 + 269.5, brown(X, Y, *K5)),
-    ),
-    "OpenSfM, perspective": (
-        "cameras.json",
-        opensfm("perspective", focal=0.6, k1=-0.21, k2=0.06),
-        at(576, 576, 479.5, 269.5, brown(X, Y, -0.21, 0.06, 0, 0)),
-    ),
-    "OpenSfM, fisheye": (
-        "cameras.json",
-        opensfm("fisheye", focal=0.6, k1=0.012, k2=-0.004),
-        at(576, 576, 479.5, 269.5, equidistant(X, Y, 0.012, -0.004)),
-    ),
+    **{
+        f"COLMAP, {model}": (
+            "cameras.txt",
+            f"# Camera list\n1 {model} {W} {H} {' '.join(map(str, (*focals, 477.5, 271.5, *k)))}\n",
+            at(focals[0], focals[-1], 477.5, 271.5, distorted) - 0.5,
+        )
+        for model, focals, k, distorted in COLMAP
+    },
+    **{
+        f"OpenSfM, {kind}": ("cameras.json", opensfm(kind, **focals, **k), at(*OPENSFM_PX["c_x" in focals], distorted))
+        for kind, focals, k, distorted in OPENSFM
+    },
     # u = w / 2 + cx + x f + x B1 + y B2, from the corner of the first pixel
     "Metashape, frame": (
         "a.xml",
-        metashape_xml(
-            "frame", f=559, cx=-2.5, cy=1.5, b1=2.0, k1=META[0], k2=META[1], k3=META[2], p1=META[4], p2=META[5]
-        ),
+        metashape_xml("frame", **FRAME, b1=2.0, **{k: v for k, v in META_K.items() if k != "k4"}),
         at(561, 559, 480 - 2.5, 270 + 1.5, metashape(X, Y, *META[:3], 0.0, *META[4:])) - 0.5,
     ),
     "Metashape, frame with k4": (
         "a.xml",
-        metashape_xml(
-            "frame", f=559, cx=-2.5, cy=1.5, k1=META[0], k2=META[1], k3=META[2], k4=META[3], p1=META[4], p2=META[5]
-        ),
+        metashape_xml("frame", **FRAME, **META_K),
         at(559, 559, 480 - 2.5, 270 + 1.5, metashape(X, Y, *META)) - 0.5,
     ),
     "Metashape, fisheye": (
         "a.xml",
-        metashape_xml("fisheye", f=559, cx=-2.5, cy=1.5, k1=0.012, k2=-0.004, k3=0.003, k4=-0.0007),
+        metashape_xml("fisheye", **FRAME, k1=0.012, k2=-0.004, k3=0.003, k4=-0.0007),
         at(559, 559, 480 - 2.5, 270 + 1.5, equidistant(X, Y, *EQUI)) - 0.5,
     ),
     "DJI": (
@@ -203,10 +201,14 @@ def test_a_calibration_projects_rays_as_its_own_program_does(case: str, tmp_path
 
 
 def test_a_file_of_opencv_projects_rays_as_opencv_does(tmp_path: Path) -> None:
-    for numbers, is_fisheye, distorted in (([*K5], False, brown(X, Y, *K5)), ([*EQUI], True, equidistant(X, Y, *EQUI))):
+    """By its own functions, which the formulas above repeat."""
+    matrix, still = np.array([[561.0, 0.0, 477.5], [0.0, 559.0, 271.5], [0.0, 0.0, 1.0]]), np.zeros(3)
+    for numbers, is_fisheye, formula in (([*K5], False, brown), ([*K8], False, brown), ([*EQUI], True, equidistant)):
         opencv_xml(tmp_path, numbers, is_fisheye=is_fisheye)
-        camera = read_calibration(tmp_path / "opencv.xml", Wanted()).camera
-        assert np.abs(pixels(camera) - at(*INTRINSICS, distorted)).max() < 0.01
+        camera, distorted = read_calibration(tmp_path / "opencv.xml", Wanted()).camera, np.array(numbers)
+        seen = (cv2.fisheye if is_fisheye else cv2).projectPoints(RAYS[:, None], still, still, matrix, distorted)
+        assert np.abs(pixels(camera) - seen[0][:, 0]).max() < 0.01
+        assert np.abs(at(*INTRINSICS, formula(X, Y, *numbers)) - seen[0][:, 0]).max() < 1e-6
 
 
 def test_cameras_bin_is_read_as_cameras_txt(tmp_path: Path) -> None:

@@ -2,22 +2,26 @@
 
 import math
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 
 import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, EstimatorRun, Flight, cov_of, error_m
+from inertial_flight import InertialFlight
+from simulated_flight import ORIGIN, EstimatorRun, Flight, blind, cov_of, error_m
 from terrafix.core.camera import camera_rotation
 from terrafix.core.geodesy import euler_from_rot, rot_from_quat, rot_w_b, yaw_of
 from terrafix.core.mavlink.gimbal import quat_from_euler
 from terrafix.estimator.measurements.gimbal import GimbalReports
+from terrafix.link.pilot_text.statustext import fault_text
 from terrafix.messages import (
+    CalibrationFault,
     Gimbal,
     GimbalAttitude,
     MapMatch,
     Message,
+    Odometry,
     Origin,
     Prediction,
     VehicleState,
@@ -154,12 +158,8 @@ def test_a_gimbal_that_was_level_for_long_is_no_longer_when_its_reports_begin_to
     assert reports.opposes and not reports.is_level
 
 
-def no_report(_i: int, _state: VehicleState) -> list[GimbalAttitude]:
-    return []
-
-
-def lost(i: int, state: VehicleState) -> list[GimbalAttitude]:
-    return [held(state)] if i < 20 else []
+def lost(i: int, state: VehicleState, from_frame: int = 20) -> list[GimbalAttitude]:
+    return [held(state)] if i < from_frame else []
 
 
 def frozen(i: int, state: VehicleState) -> list[GimbalAttitude]:
@@ -185,9 +185,19 @@ def ambiguous(i: int, state: VehicleState) -> list[GimbalAttitude]:
     return [GimbalAttitude(t_ns=state.t_ns, q=q, from_north=True)]
 
 
-@pytest.mark.parametrize("reports", [no_report, lost, frozen, late, ambiguous, of_servos])
-def test_the_claim_holds_when_reports_are_missing_late_frozen_or_ambiguous(reports: Reports) -> None:
+NAMED = {
+    **dict.fromkeys((partial(lost, from_frame=0), lost), "gimbal not reported"),
+    frozen: "gimbal repeats a report",
+    of_servos: "gimbal reports its servos",
+    **dict.fromkeys((late, ambiguous), ""),
+}
+
+
+@pytest.mark.parametrize(("reports", "named"), NAMED.items())
+def test_the_claim_holds_when_reports_are_missing_late_frozen_or_ambiguous(reports: Reports, named: str) -> None:
     run = flown(reports)
+    faults = [fault_text(message) for message in run.published if isinstance(message, CalibrationFault)]
+    assert f"{named}: level assumed" in faults if named else not faults
     assert sigmas(run).max() < 3.5
     assert errors_m(run)[20:].mean() < 2.0 * errors_m(fixed())[20:].mean() + (8.0 if reports is frozen else 1.0)
 
@@ -205,6 +215,21 @@ def test_a_gimbal_that_looks_away_gives_no_match_and_its_own_verdict() -> None:
     assert not predicted & set(AWAY) and FRAMES - 1 in predicted
     assert sigmas(run).max() < 3.5
     assert errors_m(run)[-1] < 10.0
+
+
+def test_without_images_the_velocity_is_as_sure_as_by_a_fixed_camera_whatever_the_gimbal_reports() -> None:
+    flight, sigmas_mps = InertialFlight(seed=4, seconds=45), []
+    for on_gimbal in (False, True):
+        run = EstimatorRun()
+        run.feed([origin() if on_gimbal else ORIGIN])
+        for i, messages in enumerate(flight.messages_by_frame):
+            for message in messages:
+                if i < 35 or not isinstance(message, MapMatch):
+                    run.feed([blind(message) if i >= 35 and isinstance(message, Odometry) else message])
+                if on_gimbal and i < 35 and isinstance(message, VehicleState):
+                    run.feed([held(message)])
+        sigmas_mps.append(run.estimates()[-1].velocity_sigma_mps)
+    assert sigmas_mps[1] < 1.2 * sigmas_mps[0]
 
 
 def test_a_gimbal_counts_from_its_first_report_on_unless_it_is_required() -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from simulated_flight import EstimatorRun, Flight, cov_of, error_m, without_fix
+from terrafix.estimator.models.terrain import Terrain
 from terrafix.messages import Prediction
 
 FIRST_MATCH = 36
@@ -23,3 +24,11 @@ def test_the_height_stays_unknown_until_a_match_measures_it(knows: set[str]) -> 
     off = error_m(last, flight)[:2]
     assert float(off @ np.linalg.solve(cov_of(last)[:2, :2], off)) < 13.8
     assert last.velocity_sigma_mps < 3.0
+
+
+def test_a_camera_below_the_ground_has_an_unknown_height_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight, run = Flight(20, seed=3, telemetry=frozenset()), EstimatorRun()
+    run.fly(flight, 0, 19, without_fix)
+    monkeypatch.setattr(Terrain, "height_above_m", lambda _self, p_m: float(p_m[2]) - 900.0)
+    run.fly(flight, 19, 20, without_fix)
+    assert "where the ground is" in run.verdicts("reset")[19].detail and run.estimate(19).cov[14] > 100.0**2

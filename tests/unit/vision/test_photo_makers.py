@@ -64,15 +64,16 @@ def lens(path: Path) -> tuple[float | None, tuple[float, float] | None, str]:
     return info.focal_px, info.lens.centre_px, info.lens.problem
 
 
-@pytest.mark.parametrize("zoom", [1.0, 1.4, 2.0, 4.0])
+@pytest.mark.parametrize("zoom", [0.0, 1.0, 1.4, 2.0, 4.0])
 def test_the_digital_zoom_multiplies_the_focal_length_of_the_lens(zoom: float, tmp_path: Path) -> None:
-    """Nor FocalLength, nor the calibration of DJI contains it."""
+    """Nor FocalLength, nor the calibration of DJI contains it. 0: there is none."""
+    by = zoom or 1.0
     table = photo(tmp_path / "a.jpg", model="L1D-20c", focal_mm=10.26, zoom=zoom)
-    assert lens(table)[0] == pytest.approx(10.26 / 13.2 * WIDTH * zoom)
+    assert lens(table)[0] == pytest.approx(10.26 / 13.2 * WIDTH * by)
     plane = photo(tmp_path / "b.jpg", focal_mm=8.0, plane=40.0, zoom=zoom)
-    assert lens(plane)[0] == pytest.approx(320.0 * zoom)
+    assert lens(plane)[0] == pytest.approx(320.0 * by)
     calibrated = photo(tmp_path / "c.jpg", dji(**CALIBRATED), zoom=zoom)
-    assert lens(calibrated)[0] == pytest.approx(FOCAL_PX * zoom)
+    assert lens(calibrated)[0] == pytest.approx(FOCAL_PX * by)
 
 
 def test_a_zoom_with_the_35_mm_equivalent_alone_is_refused_since_makers_differ(tmp_path: Path) -> None:
@@ -80,11 +81,6 @@ def test_a_zoom_with_the_35_mm_equivalent_alone_is_refused_since_makers_differ(t
     photo(tmp_path / "a.jpg", focal_35=24, zoom=2.0)
     with pytest.raises(SourceError, match=r"digital zoom of 2.*FocalLengthIn35mmFilm alone.*write a flight.toml"):
         open_source(str(tmp_path))
-
-
-@pytest.mark.parametrize("zoom", [0.0, 1.0])
-def test_no_digital_zoom_is_stated_as_zero_or_one(zoom: float, tmp_path: Path) -> None:
-    assert lens(photo(tmp_path / "a.jpg", dji(**CALIBRATED), zoom=zoom))[0] == FOCAL_PX
 
 
 @pytest.mark.parametrize(

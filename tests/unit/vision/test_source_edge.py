@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from source_folders import flight, picture
+from source_folders import flight, picture, source_of
 from terrafix.core.clock import now_ns
 from terrafix.core.config import Config, HealthSection, SourceSection
 from terrafix.core.errors import SourceError, UsageError
@@ -139,38 +139,16 @@ def test_the_newest_frame_is_delivered_and_dropped_frames_are_published_with_an_
     assert times == sorted(times)
 
 
-class BrokenSource:
-    """A source that can raise, and can act as a live camera, whose frame ids restart at 0."""
-
-    def __init__(self, real: str, live: bool, bug: bool) -> None:
-        self._real = open_source(real)
-        self.live = live
-        self._bug = bug
-        self.origin, self.map_hint, self.name = self._real.origin, self._real.map_hint, self._real.name
-
-    def length(self) -> int | None:
-        return None
-
-    def close(self) -> None:
-        pass
-
-    def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
-        if self._bug:
-            raise ZeroDivisionError("a bug")
-        for i in range(2):
-            frame = Frame(t_ns=now_ns(), frame_id=i, file="", width=320, height=240)
-            yield Shot(frame, (), picture(i))
-
-
-def test_an_exception_in_the_reader_thread_ends_the_process(tmp_path: Path, listen: Listen) -> None:
-    listener = listen(BrokenSource(str(flight(tmp_path / "f")), live=False, bug=True))
+def test_an_exception_in_the_reader_thread_ends_the_process(listen: Listen) -> None:
+    listener = listen(source_of(lambda: 1 / 0))
     with pytest.raises(ZeroDivisionError):
         listener.until(lambda: False)
 
 
-def test_frame_ids_of_a_camera_increase_over_a_restart(tmp_path: Path, listen: Listen) -> None:
-    camera = BrokenSource(str(flight(tmp_path / "f")), live=True, bug=False)
+def test_frame_ids_of_a_camera_increase_over_a_restart(listen: Listen) -> None:
+    frames = (Frame(t_ns=now_ns(), frame_id=i, file="", width=320, height=240) for i in range(2))
     store = MemoryFrameStore()
+    camera = source_of(lambda: (Shot(frame, (), picture(frame.frame_id)) for frame in frames))
     listener = listen(camera, now_ns() - 5 * 10**9, store=store)
     listener.until(listener.ended)
     first, second = (f.frame_id for f in listener.frames)

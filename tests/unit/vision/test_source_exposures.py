@@ -2,7 +2,6 @@
 
 import queue
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +19,12 @@ from autopilot_logs import (
     write_ulog,
 )
 from autopilot_logs import flight as attitudes
-from flight_records import origin
 from source_folders import flight as write_folder
+from source_folders import source_of
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.link.autopilot.packet_decoder import PacketDecoder
 from terrafix.link.mavlink.timesync import TimeSync
-from terrafix.messages import STAMP_SIGMA_S, Exposure, Frame, Origin
+from terrafix.messages import STAMP_SIGMA_S, Exposure, Frame
 from terrafix.vision.edge import SourceEdge
 from terrafix.vision.sources import Shot
 from terrafix.vision.sources.exposed import ReportedExposures
@@ -91,15 +90,17 @@ def test_rows_of_another_camera_are_refused_with_a_line(tmp_path: Path) -> None:
     assert any(fact.text.startswith("CAM of telemetry.bin is not used: no latency") for fact in facts_of(source))
 
 
+def stamped(t_s: float, i: int, sigma_s: float = 0.2) -> Frame:
+    t_ns = round(t_s * 1e9)
+    return Frame(t_ns=t_ns, frame_id=i, file="", width=1, height=1, buffered=True, stamp_sigma_s=sigma_s)
+
+
 def test_a_live_camera_gets_the_times_of_reports_that_come_before_or_after_its_images() -> None:
     exposed, times_s = ReportedExposures(), []
     for i, t_s in enumerate(EXPOSED_S.tolist()):
         if i % 4:  # each fourth report is late by more than the image
             exposed.add(Exposure(t_ns=round(t_s * 1e9), kind="CAMERA_FEEDBACK", number=i))
-        stamp_s = t_s + 0.25 + float(RNG.normal(0.0, 0.01))
-        stamp_ns = round(stamp_s * 1e9)
-        frame = Frame(t_ns=stamp_ns, frame_id=i, file="", width=1, height=1, buffered=True, stamp_sigma_s=0.2)
-        got = exposed.exposed(frame)
+        got = exposed.exposed(stamped(t_s + 0.25 + float(RNG.normal(0.0, 0.01)), i))
         times_s.append(got.t_ns * 1e-9)
         if not i % 4:
             exposed.add(Exposure(t_ns=round(t_s * 1e9), kind="CAMERA_FEEDBACK", number=i))
@@ -123,42 +124,19 @@ def test_a_latency_longer_than_a_frame_does_not_turn_the_order_of_frames() -> No
     exposed, times_s = ReportedExposures(), []
     for i, t_s in enumerate(EXPOSED_S.tolist()):
         exposed.add(Exposure(t_ns=round(t_s * 1e9), kind="CAMERA_TRIGGER", number=i))
-        stamp_ns = round((t_s + 1.2) * 1e9)
-        frame = Frame(t_ns=stamp_ns, frame_id=i, file="", width=1, height=1, buffered=True, stamp_sigma_s=0.5)
-        times_s.append(exposed.exposed(frame).t_ns * 1e-9)
+        times_s.append(exposed.exposed(stamped(t_s + 1.2, i, 0.5)).t_ns * 1e-9)
     assert np.diff(times_s).min() > 0.3
 
 
-class FedCamera:
-    """A live camera that gives the frames that are put into ``queue``."""
-
-    live = True
-
-    def __init__(self) -> None:
-        self.queue: queue.Queue[Frame | None] = queue.Queue()
-
-    def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
-        while (frame := self.queue.get()) is not None:
-            yield Shot(frame, (), None)
-
-    def origin(self) -> Origin:
-        return origin()
-
-    def length(self) -> None:
-        return None
-
-    def close(self) -> None:
-        self.queue.put(None)
-
-
 def test_the_edge_of_vision_publishes_frames_at_the_exposures_that_it_hears_of() -> None:
-    camera, got = FedCamera(), list[int]()
-    edge = SourceEdge(camera, MemoryFrameStore(), None, False)  # type: ignore[arg-type]
+    fed, got = queue.Queue[Frame | None](), list[int]()
+    camera = source_of(lambda: (Shot(frame, (), None) for frame in iter(fed.get, None)))
+    camera.close.side_effect = lambda: fed.put(None)
+    edge = SourceEdge(camera, MemoryFrameStore(), None, False)
     try:
         for i, t_s in enumerate(EXPOSED_S[:8].tolist()):
             edge.on_message(Exposure(t_ns=round(t_s * 1e9), kind="CAMERA_FEEDBACK", number=i))
-            stamp_ns = round((t_s + 0.1) * 1e9)
-            camera.queue.put(Frame(t_ns=stamp_ns, frame_id=i, file="", width=1, height=1, stamp_sigma_s=0.2))
+            fed.put(stamped(t_s + 0.1, i))
             until_s = time.monotonic() + 10.0
             while len(got) <= i and time.monotonic() < until_s:
                 got += [message.t_ns for message in edge.poll(0) if isinstance(message, Frame)]

@@ -294,8 +294,10 @@ def gimbal(
     source: Callable[[Span], Edit] | None = None,
     *,
     is_true: bool = False,
+    cause: str = "",
 ) -> Fault:
-    return Fault(f"gimbal {name}", words, 20.0, source, telemetry, needs=frozenset({Need.GIMBAL}), is_true=is_true)
+    needs = frozenset({Need.GIMBAL})
+    return Fault(f"gimbal {name}", words, 20.0, source, telemetry, needs=needs, is_true=is_true, cause=cause)
 
 
 GIMBAL = (
@@ -304,6 +306,7 @@ GIMBAL = (
         "For 20 s the gimbal reports nothing.",
         partial(edits.gimbal_reports, age_s=lambda _: math.inf),
         is_true=True,
+        cause="gimbal not reported",
     ),
     gimbal(
         "reported late",
@@ -314,6 +317,7 @@ GIMBAL = (
         "frozen",
         "For 20 s the gimbal reports one attitude.",
         partial(edits.gimbal_reports, age_s=lambda since_s: since_s),
+        cause="gimbal repeats a report",
     ),
     gimbal(
         "drifts",
@@ -326,6 +330,7 @@ GIMBAL = (
         partial(edits.gimbal_reports, up_deg=lambda _: 90.0),
         shown(pictures.mirrored),
         is_true=True,
+        cause="without ground",
     ),
 )
 LIVE = (  # which need a rig

@@ -68,13 +68,10 @@ class AhrsCorrectionMonitor:
         out = np.array([*tilt_out, _unexplained_share(float(yaw), 2.0 * yaw_sigma_rad) * self._unmeasured[2]])
         self._removed.append((t_ns, out))
         attitude = self._telemetry.at(t_ns)
-        righted_rad = math.hypot(
-            attitude.righted_rad,
-            self._extra_tilt_sigma_rad(t_ns * 1e-9, tilt_sigma_rad),
-            attitude.stale * UNKNOWN_ATTITUDE_RAD,
-        )
-        turned_rad = math.hypot(attitude.turned_rad, attitude.stale * TURN_UNSEEN_RAD)
-        attitude = replace(attitude, righted_rad=righted_rad, turned_rad=turned_rad)
+        extra_rad = self._extra_tilt_sigma_rad(t_ns * 1e-9, tilt_sigma_rad)
+        attitude = _widened(attitude, extra_rad)
+        if attitude.vehicle is not None:
+            attitude = replace(attitude, vehicle=_widened(attitude.vehicle, extra_rad))
         if attitude.vehicle is not None:  # a gimbal levels by gyroscopes of its own
             out = out * (0.0, 0.0, 1.0)
         if not out.any() or attitude.yaw_rad is None or attitude.pitch_rad is None or attitude.roll_rad is None:
@@ -111,6 +108,13 @@ class AhrsCorrectionMonitor:
         if self._unaided_ns is None:
             return 0.0
         return UNAIDED_RAD * math.exp(-(now_s - self._unaided_ns * 1e-9) / UNAIDED_S)
+
+
+def _widened(attitude: Attitude, extra_rad: float) -> Attitude:
+    """``extra_rad``: 1-sigma of the tilt beyond the configured one and that of an old report."""
+    righted_rad = math.hypot(attitude.righted_rad, extra_rad, attitude.stale * UNKNOWN_ATTITUDE_RAD)
+    turned_rad = math.hypot(attitude.turned_rad, attitude.stale * TURN_UNSEEN_RAD)
+    return replace(attitude, righted_rad=righted_rad, turned_rad=turned_rad)
 
 
 def _unexplained_share(turned_rad: float, explained_rad: float) -> float:

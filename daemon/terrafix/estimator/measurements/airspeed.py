@@ -194,9 +194,9 @@ class AirspeedAid(AidSource):
             self._wind.reject(sample.t_s)
 
     def after_frame(self, frame: FrameState, attitude: Attitude) -> None:
-        if attitude.vehicle_yaw_rad is None or attitude.stands or self._state.yaw_gauge is not None:
+        if attitude.of_vehicle.yaw_rad is None or attitude.stands or self._state.yaw_gauge is not None:
             return
-        yaw_rad = attitude.vehicle_yaw_rad - float(self._state.graph.state(frame.node).calibration[HEADING])
+        yaw_rad = attitude.of_vehicle.yaw_rad - float(self._state.graph.state(frame.node).calibration[HEADING])
         self._wind.update(frame.t_s, frame.velocity_mps, frame.velocity_cov, attitude.airspeed_mps, yaw_rad)
 
     def observes_velocity(self, t_s: float, node: NodeState, attitude: Attitude) -> bool:
@@ -205,4 +205,4 @@ class AirspeedAid(AidSource):
     def _observation(self, t_s: float, node: NodeState, attitude: Attitude) -> AirspeedObservation | None:
         if self._state.yaw_gauge is not None:
             return None
-        return self._wind.predict(t_s, attitude.airspeed_mps, attitude.vehicle_yaw_rad, float(node.motion[UP]))
+        return self._wind.predict(t_s, attitude.airspeed_mps, attitude.of_vehicle.yaw_rad, float(node.motion[UP]))

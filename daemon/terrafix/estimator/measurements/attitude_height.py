@@ -61,7 +61,14 @@ class MountedCamera:
         height = DEFAULT_AGL_SIGMA_M * 20 if attitude.agl_m is None else max(origin.agl_sigma_m, 0.5)
         up = (origin.ground_amsl_m or 0.0) + (DEFAULT_AGL_M if attitude.agl_m is None else attitude.agl_m)
         r_w_b = rot_w_b(yaw_rad, attitude.pitch_rad or 0.0, attitude.roll_rad or 0.0)
-        self._r_p_b = np.eye(3) if attitude.vehicle is None else r_w_b.T @ rot_w_b(*attitude.vehicle)
+        body, self._r_p_b = attitude.of_vehicle, np.eye(3)
+        if (
+            body is not attitude
+            and body.yaw_rad is not None
+            and body.pitch_rad is not None
+            and body.roll_rad is not None
+        ):
+            self._r_p_b = r_w_b.T @ rot_w_b(body.yaw_rad, body.pitch_rad, body.roll_rad)
         sigmas = np.array([tilt, tilt, yaw_sigma, height])
         return attitude_height_factor(*keys, sigmas, r_w_b, self._r_b_c, up, ground_m)
 

@@ -155,13 +155,13 @@ class DeadReckoningAid(AidSource):
     def measurement(self, sample: AidSample) -> DeadReckoningMeasurement | None:
         state, attitude = self._state, sample.attitude
         reckoned = self._buffer.take(sample.t_s)
-        if reckoned is None or attitude.vehicle_yaw_rad is None or attitude.stands or state.yaw_gauge is not None:
+        if reckoned is None or attitude.of_vehicle.yaw_rad is None or attitude.stands or state.yaw_gauge is not None:
             return None
         tilt_rad = np.radians(state.origin.attitude_sigma_deg)
-        tilts_rad = tilt_rad, float(np.hypot(tilt_rad, attitude.righted_rad))
+        tilts_rad = tilt_rad, float(np.hypot(tilt_rad, attitude.of_vehicle.righted_rad))
         since = sample.imu(*sorted((round(reckoned.t_s * 1e9), round(sample.t_s * 1e9))))
         heading_bias_rad = float(state.graph.state(sample.node).calibration[HEADING])
-        at_frame = reckoned.until(sample.t_s, since, attitude.vehicle_yaw_rad, heading_bias_rad, tilts_rad)
+        at_frame = reckoned.until(sample.t_s, since, attitude.of_vehicle.yaw_rad, heading_bias_rad, tilts_rad)
         return DeadReckoningMeasurement(at_frame)
 
     def on_fused(self, sample: AidSample, verdict: Verdict) -> None:

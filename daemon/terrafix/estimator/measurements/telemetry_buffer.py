@@ -13,7 +13,7 @@ from terrafix.core.inertial import GRAVITY_MPS2, covers, integrated, rotate_to_w
 from terrafix.core.pose import log_so3, small_turns
 from terrafix.estimator.measurements.gimbal import GimbalReports, euler_of
 from terrafix.estimator.models.motion_model import WorldAcceleration
-from terrafix.messages import GimbalAttitude, Imu, VehicleState
+from terrafix.messages import GIMBAL_FAULTS, GimbalAttitude, Imu, VehicleState
 
 TURN_UNSEEN_RAD = 0.3  # 1-sigma of the change of an unreported heading up to an unseen frame [tuned]
 # 1-sigma of unreported roll and pitch: a copter in cruise tilts by 10 to 20 degrees, a plane banks as much in a turn
@@ -32,6 +32,7 @@ RATE_SPAN_NS = 40_000_000  # on each side: two intervals of the requested attitu
 MAX_ATTITUDE_GAP_NS = 260_000_000
 
 
+NOT_REPORTED, REPEATED, OF_SERVOS = GIMBAL_FAULTS
 Timed = tuple[np.ndarray, np.ndarray]  # times (N,) [ns], values (3, N)
 
 
@@ -46,13 +47,15 @@ class Attitude:
     righted_rad: float = 0.0  # 1-sigma of the tilt beyond the configured one (ahrs_correction.py)
     turned_rad: float = 0.0  # 1-sigma of the heading beyond the configured one (same)
     stale_s: float = 0.0  # from the nearest report to the frame, beyond half an interval of the slowest stream
-    # Yaw, pitch and roll of the vehicle where the angles above are those of a platform on a gimbal (gimbal.py)
-    vehicle: tuple[float, float, float] | None = None
+    # That of the vehicle, where the angles above and their errors are those of a platform on a gimbal (gimbal.py)
+    vehicle: "Attitude | None" = None
     sees_ground: bool = True  # the gimbal does not look away from it
+    gimbal_refused: str = ""  # why the attitude of a camera on a gimbal is not a reported one
 
     @property
-    def vehicle_yaw_rad(self) -> float | None:
-        return self.yaw_rad if self.vehicle is None else self.vehicle[0]
+    def of_vehicle(self) -> "Attitude":
+        """What inertial readings and airspeed refer to."""
+        return self.vehicle or self
 
     @property
     def stale(self) -> float:
@@ -105,15 +108,18 @@ class Telemetry:
         lean until it was seen to be level."""
         held = None if self.gimbal.opposes else self.gimbal.at(t_ns)
         yaw_rad, pitch_rad, roll_rad = vehicle.yaw_rad, vehicle.pitch_rad, vehicle.roll_rad
-        body = None if yaw_rad is None or pitch_rad is None or roll_rad is None else (yaw_rad, pitch_rad, roll_rad)
-        platform = replace(vehicle, vehicle=body, sees_ground=held is None or held.sees_ground)
+        platform = replace(vehicle, vehicle=vehicle, sees_ground=held is None or held.sees_ground)
         angles = np.zeros(3) if held is None else euler_of(held.q[None])[:, 0]
         if held is not None and held.from_north:
             yaw_rad = float(angles[0])
         elif yaw_rad is not None:
             yaw_rad += float(angles[0])
-        if held is None or held.age_ns > MAX_STATE_GAP_NS or self._repeats():
-            lost = replace(platform, yaw_rad=yaw_rad, turned_rad=TURN_UNSEEN_RAD, righted_rad=UNKNOWN_ATTITUDE_RAD)
+        refused = OF_SERVOS if self.gimbal.opposes else ""
+        if not refused and (held is None or held.age_ns > MAX_STATE_GAP_NS):
+            refused = NOT_REPORTED
+        if held is None or refused or self._repeats():
+            platform = replace(platform, yaw_rad=yaw_rad, gimbal_refused=refused or REPEATED)
+            lost = replace(platform, turned_rad=TURN_UNSEEN_RAD, righted_rad=UNKNOWN_ATTITUDE_RAD)
             pitches, rolls = (axis not in self.gimbal.stabilised for axis in ("pitch", "roll"))
             if not (pitches or rolls):
                 return replace(lost, pitch_rad=None, roll_rad=None)

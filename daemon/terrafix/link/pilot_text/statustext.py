@@ -1,16 +1,17 @@
 """STATUSTEXT messages for the pilot."""
 
-from terrafix.messages import CalibrationFault, StatusText
+from terrafix.messages import GIMBAL_FAULTS, CalibrationFault, StatusText
 
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY [spec: MAVLink MAV_SEVERITY]
 TOO_SLOW, TWO_SENDERS = "computer too slow", "telemetry of two senders"
 TIME_JUMPS, ATTITUDE_JUMPS = "autopilot rebooted, or its time jumps", "attitude jumps without gyros"
-# Faults of the link, which leave out frames or telemetry, by quantity: texts of their beginning and their end.
+# Faults that leave out frames or telemetry, by quantity: texts of their beginning and their end.
 LINK_FAULTS = {
     TOO_SLOW: (f"{TOO_SLOW}: {{}}", "computer keeps up again"),
     TWO_SENDERS: (f"{TWO_SENDERS}, one ignored", "telemetry of one sender again"),
     TIME_JUMPS: (TIME_JUMPS, "the autopilot's time is steady again"),
     ATTITUDE_JUMPS: (f"{ATTITUDE_JUMPS}, ignored", "the attitude is steady again"),
+    **{kind: (f"{kind}: level assumed", "the gimbal's reports are used again") for kind in GIMBAL_FAULTS},
 }
 
 

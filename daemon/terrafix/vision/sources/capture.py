@@ -120,12 +120,8 @@ def open_stream(spec: str, why: str, stopped: Callable[[], bool]) -> OpenCvCaptu
             target = f"udp://{address.host}:{address.port}"
     os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = options
     try:
-        limits = [
-            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
-            round(2 * STALL_S * 1e3),
-            cv2.CAP_PROP_READ_TIMEOUT_MSEC,
-            round(STALL_S * 1e3),
-        ]
+        stall_ms = round(STALL_S * 1e3)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 2 * stall_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, stall_ms]
         capture = cv2.VideoCapture(target, cv2.CAP_FFMPEG, limits)
     finally:
         if session is not None:

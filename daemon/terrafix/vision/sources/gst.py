@@ -135,7 +135,7 @@ class GstCapture:
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
         caps, buffer = self._sample.get_caps().get_structure(0), self._sample.get_buffer()
-        width, height = self._size()
+        width, height = self.size()
         data = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8)
         # Layout of GstVideoInfo: rows of whole 4 bytes, an even number of rows, then half as many of U and V.
         stride, rows = -(-width // 4) * 4, -(-height // 2) * 2
@@ -155,21 +155,12 @@ class GstCapture:
         sigma_s = NETWORK_SIGMA_S if self._network else STAMP_SIGMA_S
         return Stamp(t_ns if stamped and t_ns is not None else arrival_ns, self._network or not stamped, sigma_s)
 
-    def size(self) -> tuple[int, int] | None:
-        return self._size()
-
     def described(self) -> str:
         used = [element.get_factory().get_name() for element in self._elements() if _is_decoder(element)]
-        hardware = [name for name in used if name in HARDWARE_DECODERS]
         exist = [name for name in HARDWARE_DECODERS if _exists(self._gst, name)]
-        reason = (
-            "hardware"
-            if hardware
-            else f"software; of hardware {', '.join(exist)}"
-            if exist
-            else "no decoder of hardware"
-        )
-        width, height = self._size()
+        reason = f"software; of hardware {', '.join(exist)}" if exist else "no decoder of hardware"
+        reason = "hardware" if any(name in HARDWARE_DECODERS for name in used) else reason
+        width, height = self.size()
         decoder = f"{', '.join(used)} ({reason})" if used else "no decoder: raw images"
         return f"{self._version}, {decoder}, {width}x{height}"
 
@@ -182,7 +173,7 @@ class GstCapture:
         self._pipeline.set_state(self._gst.State.NULL)
         self._sample = None
 
-    def _size(self) -> tuple[int, int]:
+    def size(self) -> tuple[int, int]:
         caps = self._sample.get_caps().get_structure(0)
         return caps.get_int("width")[1], caps.get_int("height")[1]
 

@@ -6,7 +6,9 @@ Autel, senseFly, MicaSense and Parrot use, too; Parrot's namespace ``drone-parro
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -20,6 +22,8 @@ _PIX4D_URI = "pix4d.com/camera"
 # [spec: Theta-Limited/OpenAthenaIOS#62]
 _FROM_HORIZON_DEG = -45.0
 PIX4D = "Pix4D's tags"  # source of angles
+_AXES = ("Yaw", "Pitch", "Roll")
+_Numbers = Callable[[str], float | None]  # of one maker, by key
 
 
 @dataclass(frozen=True)
@@ -50,49 +54,28 @@ class Xmp:
 def read_xmp(packet: bytes) -> Xmp:
     """``packet``: the XMP of a photo; may be damaged."""
     text = packet.decode("utf-8", errors="replace")
-    dji = {key: _number(text, ("drone-dji",), key) for key in _DJI}
-    pix4d = {key: _number(text, _pix4d_prefixes(text), key) for key in ("Yaw", "Pitch", "Roll", "AboveGroundAltitude")}
-    angles, notes = _angles(text, dji, pix4d)
-    agl_m, agl_from = next(
-        (
-            (value, name)
-            for value, name in (
-                (dji["RelativeAltitude"], "RelativeAltitude of DJI"),
-                (pix4d["AboveGroundAltitude"], "AboveGroundAltitude of Pix4D's tags"),
-            )
-            if value is not None
-        ),
-        (None, ""),
+    dji, pix4d, parrot = (
+        partial(_number, text, prefixes) for prefixes in (("drone-dji",), _pix4d_prefixes(text), ("drone-parrot",))
     )
-    x_px, y_px = dji["CalibratedOpticalCenterX"], dji["CalibratedOpticalCenterY"]
-    focal_px = dji["CalibratedFocalLength"]
-    gimbal_yaw = None if notes else dji["GimbalYawDegree"]
-    heading_deg = next(
-        (yaw for yaw in (gimbal_yaw, dji["FlightYawDegree"], _parrot_yaw(text)) if yaw is not None), None
+    angles, notes = _angles(dji, pix4d, parrot)
+    heights = (
+        (dji("RelativeAltitude"), "RelativeAltitude of DJI"),
+        (pix4d("AboveGroundAltitude"), "AboveGroundAltitude of Pix4D's tags"),
     )
+    agl_m, agl_from = next((height for height in heights if height[0] is not None), (None, ""))
+    x_px, y_px, focal_px = (dji(f"Calibrated{what}") for what in ("OpticalCenterX", "OpticalCenterY", "FocalLength"))
+    yaws = None if notes else dji("GimbalYawDegree"), dji("FlightYawDegree"), parrot("CameraYawDegree")
     return Xmp(
         angles=angles,
-        heading_deg=heading_deg,
-        flight_yaw_deg=dji["FlightYawDegree"],
+        heading_deg=next((yaw for yaw in yaws if yaw is not None), None),
+        flight_yaw_deg=dji("FlightYawDegree"),
         agl_m=agl_m,
         agl_from=agl_from,
         focal_px=focal_px if focal_px is not None and focal_px > 0 else None,
         centre_px=None if x_px is None or y_px is None else (x_px, y_px),
-        focal_mm=_number(text, _pix4d_prefixes(text), "PerspectiveFocalLength"),
+        focal_mm=pix4d("PerspectiveFocalLength"),
         notes=notes,
     )
-
-
-_DJI = (
-    "RelativeAltitude",
-    "GimbalYawDegree",
-    "GimbalPitchDegree",
-    "GimbalRollDegree",
-    "FlightYawDegree",
-    "CalibratedFocalLength",
-    "CalibratedOpticalCenterX",
-    "CalibratedOpticalCenterY",
-)
 
 
 def body_angles_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
@@ -102,21 +85,19 @@ def body_angles_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -
     return euler_from_rot(r_w_gimbal @ r_gimbal_b)  # undoes the mount
 
 
-def _angles(
-    text: str, dji: dict[str, float | None], pix4d: dict[str, float | None]
-) -> tuple[BodyAngles | None, tuple[str, ...]]:
-    yaw, pitch, roll = (dji[f"Gimbal{axis}Degree"] for axis in ("Yaw", "Pitch", "Roll"))
+def _angles(dji: _Numbers, pix4d: _Numbers, parrot: _Numbers) -> tuple[BodyAngles | None, tuple[str, ...]]:
+    yaw, pitch, roll = (dji(f"Gimbal{axis}Degree") for axis in _AXES)
     if yaw is not None and pitch is not None:
         # Firmware that does not know its gimbal writes zeros, which would be a level view to the north.
         if yaw == pitch == (roll or 0.0) == 0.0:
             return None, ("gimbal angles of 0/0/0: not reported",)
         return _from_gimbal(yaw, pitch, roll or 0.0, "gimbal angles of DJI"), ()
-    yaw, pitch, roll = pix4d["Yaw"], pix4d["Pitch"], pix4d["Roll"]
+    yaw, pitch, roll = map(pix4d, _AXES)
     if yaw is not None and pitch is not None:
         if pitch < _FROM_HORIZON_DEG:
             return _from_gimbal(yaw, pitch, roll or 0.0, "Pix4D's tags, pitch from the horizon"), ()
         return BodyAngles(yaw, pitch, roll or 0.0, PIX4D), ()
-    yaw, pitch, roll = (_number(text, ("drone-parrot",), f"Camera{axis}Degree") for axis in ("Yaw", "Pitch", "Roll"))
+    yaw, pitch, roll = (parrot(f"Camera{axis}Degree") for axis in _AXES)
     if yaw is not None and pitch is not None and pitch < _FROM_HORIZON_DEG:
         return _from_gimbal(yaw, pitch, roll or 0.0, "camera angles of Parrot"), ()
     return None, ()
@@ -125,10 +106,6 @@ def _angles(
 def _from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float, source: str) -> BodyAngles:
     yaw, pitch, roll = map(math.degrees, body_angles_from_gimbal(yaw_deg, pitch_deg, roll_deg))
     return BodyAngles(yaw, pitch, roll, source)
-
-
-def _parrot_yaw(text: str) -> float | None:
-    return _number(text, ("drone-parrot",), "CameraYawDegree")
 
 
 def _pix4d_prefixes(text: str) -> tuple[str, ...]:

@@ -2,15 +2,17 @@
 
 import pytest
 
-from terrafix.estimator.monitors.refused_pictures import EMPTY, FROZEN, OTHER, RefusedPictures
+from terrafix.estimator.monitors.refused_pictures import AWAY, EMPTY, FROZEN, INPUT_KINDS, OTHER, RefusedInput
 from terrafix.link.pilot_text.statustext import fault_text
 from terrafix.messages import CalibrationFault, Verdict
 
 
 def faults_of(*verdicts: Verdict) -> list[CalibrationFault]:
     """Of frames half a second apart."""
-    refused = RefusedPictures()
-    return [fault for k, verdict in enumerate(verdicts) for fault in refused.add(k * 500_000_000, verdict)]
+    refused = RefusedInput()
+    return [
+        fault for k, verdict in enumerate(verdicts) for fault in refused.add(k * 500_000_000, INPUT_KINDS.get(verdict))
+    ]
 
 
 @pytest.mark.parametrize(
@@ -19,6 +21,7 @@ def faults_of(*verdicts: Verdict) -> list[CalibrationFault]:
         ([Verdict.STALLED] * 7, FROZEN),
         ([Verdict.FEW_INLIERS, Verdict.IMPLAUSIBLE, *[Verdict.UNCONFIRMED] * 6], OTHER),
         ([Verdict.FEW_INLIERS] * 8, EMPTY),
+        ([Verdict.NO_GROUND] * 7, AWAY),
     ],
 )
 def test_a_run_of_refused_pictures_is_named_from_its_first_one_to_three_used_ones(

@@ -83,13 +83,6 @@ class Renderer:
         flow = self._flow_px_per_s(view) if self._film.exposure_s and motion is not STILL else None
         return self._developer.develop(self._with_weather(self._scene(view), view, t_s), index, flow)
 
-    def ideal(
-        self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray, *, t_s: float = 0.0, motion: CameraMotion = STILL
-    ) -> np.ndarray:
-        """Returns the scene through lens and air, without sensor model: (H, W, 3) uint8."""
-        view = self._view(p_c_in_w_m, r_w_c, motion)
-        return self._with_weather(self._scene(view), view, t_s)
-
     def ground_points(self, p_c_in_w_m: np.ndarray, r_w_c: np.ndarray) -> np.ndarray:
         """Returns the intersections of the coarse grid's rays with the ground: (rows, columns, 3) east, north, up."""
         return self._view(p_c_in_w_m, r_w_c, STILL).points_m
