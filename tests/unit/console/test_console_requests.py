@@ -1,5 +1,6 @@
 """Requests to the console: what is taken, and what is refused with a problem that says why."""
 
+import json
 import random
 import socket
 import sqlite3
@@ -84,7 +85,11 @@ def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
         ({"name": "x" * 101}, "name"),
         ({"height_m": "high"}, "height_m"),
         ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}]}}, "no map sources"),
-        ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 9, "lon": 9}]}}, "km2"),
+        # 1 degree is 111.32 km: (111.32 + 19) * 19
+        (
+            {"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}], "corridor_m": 9500}},
+            "2476 km2",
+        ),
     ],
 )
 def test_a_flight_that_is_not_valid_is_refused_with_the_field(
@@ -262,6 +267,8 @@ def test_errors_of_http_itself_are_problems_too(console: Console) -> None:
     assert_refused(console.send("POST", "/flights", b"{not json", {"content-type": "application/json"}), 422)
     assert_refused(console.send("POST", "/flights", b"[" * 100_000, {"content-type": "application/json"}), 400)
     assert_refused(console.send("POST", "/flights", b" " * 3_000_000, {"content-type": "application/json"}), 413)
+    chunks = iter([b" " * console.service.settings.limits.body_bytes, json.dumps(NEW).encode()])
+    assert_refused(console.send("POST", "/flights", chunks, {"content-type": "application/json"}), 400)
     assert_refused(console.send("GET", "/flights/UPPER"), 422)
     assert console.send("GET", "/page/..%2f..%2fcli.py").status == 404
 
@@ -351,6 +358,18 @@ def test_without_the_console_extra_one_line_states_what_to_install(tmp_path: Pat
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
     assert done.stderr == f"terrafix: this command needs fastapi; install it: {install_command('console')}\n"
+
+
+@pytest.mark.parametrize(("second", "begin_s"), [(40, 40.0), (3, 10.0)])
+def test_a_further_batch_begins_when_its_camera_says_and_never_before_the_last(
+    console: Console, second: int, begin_s: float
+) -> None:
+    flight_id = console.create()
+    for first, at in ((0, 0), (10, second)):
+        parts = [("images", f"IMG_{first + i:04d}.jpg", photo(at + i)) for i in range(10)]
+        assert console.upload(flight_id, parts).status == 202
+    with console.service.database.read() as db:
+        assert flights.images_of(db, flight_id, 10, 1)[0].t_ns == begin_s * 1e9
 
 
 def facts(console: Console, parts: list[tuple[str, str, bytes]]) -> Answer:

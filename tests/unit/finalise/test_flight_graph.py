@@ -1,6 +1,7 @@
 """Batch smoother after landing: accuracy, consistency, and rejection of outlier map matches."""
 
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import msgspec
@@ -15,6 +16,7 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.estimator.models.lens_prior import principal_point_sigma
 from terrafix.messages import MapMatch, Message, SearchResult, Verdict
+from terrafix.smoother.gnc import solve
 from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.fix_consistency import lost_sigma
@@ -97,6 +99,15 @@ def test_map_matches_over_the_same_ground_count_with_their_share(monkeypatch: py
     monkeypatch.setattr(batch_smoother, "information_shares", lambda flight: [0.2] * len(flight.fixes))
     shared = smooth(graph)
     assert np.trace(shared.covs[-1]) > 1.2 * np.trace(alone.covs[-1])
+
+
+def test_a_map_match_that_agrees_with_the_solution_is_readmitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_the_first(*given: Any) -> tuple[gtsam.Values, np.ndarray]:
+        values, inliers = solve(*given)
+        return values, inliers & (np.arange(len(inliers)) > 0)
+
+    monkeypatch.setattr(batch_smoother, "solve", without_the_first)
+    assert smooth(replayed_graph(Flight(12, seed=4, fix_every=3))).inliers.all()
 
 
 def test_a_blackout_is_interpolated_from_both_sides() -> None:

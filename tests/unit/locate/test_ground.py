@@ -10,6 +10,8 @@ import pointed_flight as rig
 from flight_records import write_record
 from terrafix import messages as m
 from terrafix.core.errors import SourceError
+from terrafix_tools.console.compute.locating import Locators
+from terrafix_tools.console.locating import Question
 from terrafix_tools.finalise.point_cloud import POINTS, VERTEX, write_ply
 from terrafix_tools.finalised import write
 from terrafix_tools.locate.cloud import PointCloud, build_cloud
@@ -180,11 +182,12 @@ def test_the_points_of_a_finalised_flight_are_used_whatever_their_fragment(tmp_p
     points["fragment"] = 7
     write_ply(tmp_path / POINTS, points, rig.ORIGIN)
     write_record(tmp_path / "flight.mcap", [x for x in rig.messages() if not getattr(x, "three_view", None)])
-    roof = ("3", rig.pixel(3, np.array([rig.HOUSE_E_M, 0.0, rig.START_AMSL_M + rig.HOUSE_M])))
-    assert FlightLocator.open(tmp_path).locate([roof]).surface is Surface.PLANE
+    roof = rig.pixel(3, np.array([rig.HOUSE_E_M, 0.0, rig.START_AMSL_M + rig.HOUSE_M]))
+    locators, question = Locators(), Question(str(tmp_path), "", [(3, roof)])
+    assert locators.answer(question).surface == "plane"
     write(tmp_path, [], {"flights": [{"solution": "refined"}]})
-    found = FlightLocator.open(tmp_path).locate([roof])
-    assert found.surface is Surface.POINTS and found.p_m[2] == pytest.approx(512.0, abs=0.2)
+    found = locators.answer(question)
+    assert found.surface == "points" and found.alt_amsl_m == pytest.approx(512.0, abs=0.2)
     (tmp_path / POINTS).write_bytes(b"ply")
     with pytest.raises(SourceError, match=r"points\.ply: cannot be read"):
         FlightLocator.open(tmp_path)

@@ -67,6 +67,11 @@ def test_several_pixels_find_the_height_of_what_stands_above_the_ground(sigma_m:
     assert np.hypot(*(alone.p_m - MAST_M)[:2]) > 5.0 and alone.cov[2, 2] == pytest.approx(900.0, rel=1e-3)
 
 
+def test_a_height_that_the_pixels_do_not_determine_is_that_of_the_ground() -> None:
+    above = np.array([30.0, 10.0, 505.0])  # two cameras 20 m apart know the height to 14 m
+    assert locate_object([at(0, above), at(1, above)], [level(0.2)] * 2).p_m[2] == pytest.approx(500.0, abs=0.1)
+
+
 def test_level_of_camera_and_ground_is_in_the_height_and_not_in_the_position() -> None:
     point = np.array([60.0, 0.0, 500.0])
     one, other = (locate_object([at(0, point)], [replace(level(0.3), level_sigma_m=s)]).cov for s in (0.0, 2.0))
@@ -90,13 +95,6 @@ def test_most_exact_ground_of_the_first_kind_counts() -> None:
     found = locate_object([at(i, point) for i in (1, 2, 3)], patches)
     assert found.surface is Surface.POINTS
     assert found.p_m == pytest.approx(point, abs=1e-6)
-
-
-def test_pixels_of_two_objects_are_not_consistent() -> None:
-    here, there = np.array([30.0, 0.0, 500.0]), np.array([30.0, 25.0, 500.0])
-    found = locate_object([at(1, here), at(2, here), at(2, there)], [level(1.0)] * 3)
-    assert not found.consistent and int(np.argmax(found.test_ratios)) == 2
-    assert locate_object([at(1, here), at(2, here)], [level(1.0)] * 2).consistent
 
 
 def test_test_ratio_is_the_squared_mahalanobis_distance_over_its_gate() -> None:
