@@ -51,17 +51,7 @@ def camera_m(i: int) -> np.ndarray:
 
 def view(i: int, cov: np.ndarray) -> CameraView:
     """Camera of frame ``i`` with ``cov`` (6, 6)."""
-    return CameraView(
-        frame_id=i,
-        file="",
-        t_ns=0,
-        p_c_in_w_m=camera_m(i),
-        r_w_c=r_w_c(),
-        cov=cov,
-        calibration=CameraCalibration.of(CAMERA),
-        ground_m=START_AMSL_M,
-        fragment_id=0,
-    )
+    return CameraView(i, "", 0, camera_m(i), r_w_c(), cov, CameraCalibration.of(CAMERA), START_AMSL_M, fragment_id=0)
 
 
 def normalised(i: int, points_m: np.ndarray) -> np.ndarray:

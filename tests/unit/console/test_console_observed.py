@@ -73,14 +73,11 @@ def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
     assert [name_of(type(e)) for e in outcome.events] == ["frame_processed", "fragment_changed"]
 
 
-def test_the_ellipse_points_along_its_longer_axis() -> None:
+def test_the_ellipse_points_along_its_longer_axis_and_the_confidence_is_that_of_the_worse_one() -> None:
     east = ellipse_of(np.diag([9.0, 1.0]))
     assert (east.bearing_deg, east.semi_major_m, east.semi_minor_m) == (90.0, 7.34, 2.45)
     turn = np.array([[math.cos(0.5), math.sin(0.5)], [-math.sin(0.5), math.cos(0.5)]])  # 0.5 rad from east to south
     assert ellipse_of(turn @ np.diag([9.0, 1.0]) @ turn.T).bearing_deg == pytest.approx(90 + math.degrees(0.5), abs=0.1)
-
-
-def test_the_confidence_is_that_of_the_worse_axis() -> None:
     assert confidence_of(np.diag([400.0, 1.0])) == pytest.approx(1.0 - math.exp(-0.5), abs=1e-4)
 
 

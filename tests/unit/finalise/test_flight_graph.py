@@ -21,6 +21,7 @@ from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.fix_consistency import lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer
+from terrafix_tools.finalise.submaps import _submap
 from terrafix_tools.score import nees_of
 
 FAR_M = (350.0, -200.0)
@@ -108,6 +109,24 @@ def test_a_map_match_that_agrees_with_the_solution_is_readmitted(monkeypatch: py
 
     monkeypatch.setattr(batch_smoother, "solve", without_the_first)
     assert smooth(replayed_graph(Flight(12, seed=4, fix_every=3))).inliers.all()
+
+
+@pytest.mark.parametrize(("learnt", "factors"), [(1.0, 1), (0.5, 2)])
+def test_a_learnt_height_scale_is_the_sum_of_barometer_and_focal_length(learnt: float, factors: int) -> None:
+    graph = replayed_graph(Flight(2, seed=4))
+    first, smoothing = graph.recorder.nodes[0], batch_smoother._Smoothing(graph, lambda _done, _of: None)
+    assert first.calibration is not None
+    first.calibration = first.calibration[0], learnt * first.calibration[1]
+    smoothing._sees_lens = True
+    assert len(list(smoothing._calibration_factors(0, first))) == factors
+
+
+def test_an_error_of_the_height_is_the_scale_of_a_segment_and_not_of_its_steps() -> None:
+    first, node = replayed_graph(Flight(2, seed=4)).recorder.nodes
+    assert node.motion is not None and node.motion.rays is not None
+    ground, step_m = node.motion.rays.ground, node.motion.r.T @ node.motion.p_m
+    left = node.motion.cov - _submap([first, node], 0, 0.1).step_cov[1]
+    assert np.trace(left) == pytest.approx(step_m @ step_m * (ground.height_sigma_m / ground.height_m) ** 2)
 
 
 def test_a_blackout_is_interpolated_from_both_sides() -> None:

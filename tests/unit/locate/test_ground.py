@@ -160,6 +160,7 @@ def test_cloud_of_a_flight_has_ground_and_house(tmp_path: Path) -> None:
     assert len(cloud.points_m) > 2000 and on_house.sum() > 50
     assert np.abs(cloud.points_m[:, 2] - true_m).max() < 0.05
     assert cloud.sigma_m.min() > 0.0 and cloud.sigma_m.max() < 2.0
+    assert len(build_cloud(flight, 1, None).points_m) == 0, "of another fragment"
 
 
 def test_cloud_has_the_level_of_the_elevation(tmp_path: Path) -> None:
@@ -167,11 +168,6 @@ def test_cloud_has_the_level_of_the_elevation(tmp_path: Path) -> None:
     cloud = build_cloud(flight, 0, lambda e_m, _n_m: np.full(e_m.shape, 503.0))
     away = np.abs(cloud.points_m[:, 0] - rig.HOUSE_E_M) > 25.0
     assert np.median(cloud.points_m[away, 2]) == pytest.approx(503.0, abs=0.05)
-
-
-def test_cloud_of_another_fragment_is_empty(tmp_path: Path) -> None:
-    flight = read_views(rig.write_flight(tmp_path / "flight.mcap"))
-    assert len(build_cloud(flight, 1, None).points_m) == 0
 
 
 def test_the_points_of_a_finalised_flight_are_used_whatever_their_fragment(tmp_path: Path) -> None:

@@ -208,8 +208,7 @@ def test_map_matches_that_move_the_past_a_little_each_move_it_together(matches: 
 
 
 def test_the_scale_walks_from_frame_to_frame_to_a_keyframe() -> None:
-    graph = KeyframeGraph()
-    track = Track(smoother=SmootherNode(graph=graph))
+    track = Track(smoother=SmootherNode(graph=(graph := KeyframeGraph())))
     track.feed([track.prediction(0), track.prediction(7), track.link(7, 0)])
     assert graph.frames[7].walk2 == pytest.approx(7 * KNOWN_HEIGHT_WALK**2)
 
