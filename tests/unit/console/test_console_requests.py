@@ -347,9 +347,7 @@ def test_without_the_console_extra_one_line_states_what_to_install(tmp_path: Pat
 
 
 @pytest.mark.parametrize(("second", "begin_s"), [(40, 40.0), (3, 10.0)])
-def test_a_further_batch_begins_when_its_camera_says_and_never_before_the_last(
-    console: Console, second: int, begin_s: float
-) -> None:
+def test_a_further_batch_begins_when_its_camera_says_or_later(console: Console, second: int, begin_s: float) -> None:
     flight_id = console.create()
     for first, at in ((0, 0), (10, second)):
         parts = [("images", f"IMG_{first + i:04d}.jpg", photo(at + i)) for i in range(10)]

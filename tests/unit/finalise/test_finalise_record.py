@@ -139,9 +139,7 @@ def test_an_outlier_map_match_is_counted_in_the_summary(tmp_path: Path) -> None:
     [([], "no origin"), ([frame(0)], "no origin"), (None, "no flight record"), (b"no record", "not a flight record")],
     ids=["empty", "no origin", "no record", "another file"],
 )
-def test_a_folder_without_a_usable_record_raises_a_source_error(
-    recorded: list[Message] | bytes | None, expected: str, tmp_path: Path
-) -> None:
+def test_what_is_no_record_is_refused(recorded: list[Message] | bytes | None, expected: str, tmp_path: Path) -> None:
     if isinstance(recorded, bytes):
         (tmp_path / "flight.mcap").write_bytes(recorded)
     elif recorded is not None:

@@ -7,6 +7,7 @@ import gtsam
 import msgspec
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import M
 
 from map_matches import with_search
 from recorded_flight import blind_between, errors, replayed_graph, shifted, unmatched
@@ -119,6 +120,12 @@ def test_a_learnt_height_scale_is_the_sum_of_barometer_and_focal_length(learnt: 
     first.calibration = first.calibration[0], learnt * first.calibration[1]
     smoothing._sees_lens = True
     assert len(list(smoothing._calibration_factors(0, first))) == factors
+
+
+def test_a_start_has_the_offset_of_the_map_that_most_matches_use() -> None:
+    graph = replayed_graph(Flight(12, seed=4, fix_every=3))
+    graph.fixes[0] = replace(graph.fixes[0], map_sigma_m=99.0)
+    assert batch_smoother._Smoothing(graph, lambda _done, _of: None)._start_factor(0).factor.keys()[0] == M(0)
 
 
 def test_an_error_of_the_height_is_the_scale_of_a_segment_and_not_of_its_steps() -> None:
@@ -246,7 +253,7 @@ def test_consistent_outliers_at_the_end_widen_the_covariance_over_both_positions
     graph = replayed_graph(flight, alter)
     smoothed = smooth(graph)
     errors_m, covs = errors(flight, graph, smoothed)
-    assert np.all(nees_of(errors_m, covs)[75:] < 9.21) and covs[80, 0, 0] > 30.0**2
+    assert np.all(nees_of(errors_m, covs)[75:] < 9.21) and covs[80, 0, 0] > 30.0**2 > 10.0**2 > covs[40, 0, 0]
 
 
 def test_a_record_with_two_origins_gives_two_flights() -> None:
