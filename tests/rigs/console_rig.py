@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -79,10 +79,11 @@ class Console:
         self._thread.join()
 
     def send(self, method: str, path: str, body: object = None, headers: dict[str, str] | None = None) -> Answer:
-        """``body``: bytes as they are, anything else as JSON."""
+        """``body``: bytes as they are, in chunks if they are several, anything else as JSON."""
         sent = dict(headers or {})
-        data = body if isinstance(body, bytes) or body is None else json.dumps(body).encode()
-        if body is not None and not isinstance(body, bytes):
+        plain = body is None or isinstance(body, bytes | Iterator)
+        data = body if plain else json.dumps(body).encode()
+        if not plain:
             sent.setdefault("content-type", "application/json")
         answer = self._http.request(method, self.url + path, body=data, headers=sent)
         return Answer(answer.status, answer.headers, answer.data)

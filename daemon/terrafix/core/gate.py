@@ -8,7 +8,7 @@ CHI2_95 = 5.991
 SIGMAS_95 = math.sqrt(CHI2_95)
 
 # Chi-square quantiles at 99.9 % by degrees of freedom. [spec: chi-square distribution]
-GATE = {2: 13.82, 3: 16.27, 6: 22.46, 7: 24.32}
+GATE = {1: 10.83, 2: 13.82, 3: 16.27, 6: 22.46, 7: 24.32}
 
 # Components of a Gaussian mixture below this weight are neglected: a 95 % confidence ellipse may leave out 5 % of the
 # probability. [spec: 95 % confidence level]

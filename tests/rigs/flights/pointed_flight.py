@@ -7,9 +7,10 @@ import numpy as np
 
 from flight_records import ORIGIN, PERIOD_NS, write_record
 from terrafix import messages as m
-from terrafix.core.camera import Mount
+from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.geodesy import quat_from_rot, rot_w_b
 from terrafix_lab.sim.true_messages import estimate as true_estimate
+from terrafix_tools.locate.views import CameraView
 
 CAMERA = m.Camera(width=800, height=600, fx=500.0, fy=500.0, cx=399.5, cy=299.5, focal_sigma=0.01)
 START_AMSL_M = 500.0
@@ -46,6 +47,11 @@ def r_w_c() -> np.ndarray:
 
 def camera_m(i: int) -> np.ndarray:
     return np.array([STEP_M * i, 0.0, START_AMSL_M + AGL_M])
+
+
+def view(i: int, cov: np.ndarray) -> CameraView:
+    """Camera of frame ``i`` with ``cov`` (6, 6)."""
+    return CameraView(i, "", 0, camera_m(i), r_w_c(), cov, CameraCalibration.of(CAMERA), START_AMSL_M, fragment_id=0)
 
 
 def normalised(i: int, points_m: np.ndarray) -> np.ndarray:

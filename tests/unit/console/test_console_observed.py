@@ -73,14 +73,11 @@ def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
     assert [name_of(type(e)) for e in outcome.events] == ["frame_processed", "fragment_changed"]
 
 
-def test_the_ellipse_points_along_its_longer_axis() -> None:
+def test_the_ellipse_points_along_its_longer_axis_and_the_confidence_is_that_of_the_worse_one() -> None:
     east = ellipse_of(np.diag([9.0, 1.0]))
     assert (east.bearing_deg, east.semi_major_m, east.semi_minor_m) == (90.0, 7.34, 2.45)
     turn = np.array([[math.cos(0.5), math.sin(0.5)], [-math.sin(0.5), math.cos(0.5)]])  # 0.5 rad from east to south
     assert ellipse_of(turn @ np.diag([9.0, 1.0]) @ turn.T).bearing_deg == pytest.approx(90 + math.degrees(0.5), abs=0.1)
-
-
-def test_the_confidence_is_that_of_the_worse_axis() -> None:
     assert confidence_of(np.diag([400.0, 1.0])) == pytest.approx(1.0 - math.exp(-0.5), abs=1e-4)
 
 
@@ -89,8 +86,9 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
     flight.frame(m.Verdict.ACCEPTED)
     flight.searches(1)
     lost = flight.frame(LOST, WIDEN)
-    assert of_kind(lost, SearchExpanded, StateChanged) == [
+    assert of_kind(lost, SearchExpanded, RecoveryStarted, StateChanged) == [
         SearchExpanded(frame_id=1, file="0001.jpg", grid_size=1, status="widen"),
+        RecoveryStarted(frame_id=1, file="0001.jpg"),
         StateChanged(state=FlightState.RECOVERING, previous=FlightState.PROCESSING),
     ]
     assert of_kind(flight.frame(LOST, WIDEN), SearchExpanded, StateChanged) == []
@@ -111,10 +109,11 @@ def test_a_loss_widens_asks_once_and_ends_with_the_place() -> None:
     assert (third.gps.lat, third.gps.lon, third.half_size_m) == (48.002, 11.0, 66.7)
     assert asked.state is FlightState.BLOCKED and asked.request is not None and asked.request.frame_id == 5
     again = flight.frame(LOST, m.SearchStep.NEW_FRAGMENT)
-    assert of_kind(again, UserInputNeeded, StateChanged) == [] and again.state is FlightState.BLOCKED
+    assert of_kind(again, UserInputNeeded, RecoveryStarted, StateChanged) == [] and again.state is FlightState.BLOCKED
     found = flight.frame(m.Verdict.ACCEPTED, m.SearchStep.MERGE)
-    assert of_kind(found, SearchExpanded, StateChanged) == [
+    assert of_kind(found, SearchExpanded, RecoverySucceeded, StateChanged) == [
         SearchExpanded(frame_id=7, file="0007.jpg", grid_size=None, status="found"),
+        RecoverySucceeded(frame_id=7, file="0007.jpg", frames=6),
         StateChanged(state=FlightState.PROCESSING, previous=FlightState.BLOCKED),
     ]
     assert found.request is None
@@ -140,39 +139,15 @@ def test_a_flight_that_is_lost_when_its_images_are_through_asks_once() -> None:
     assert flight.observer.images_through() is None
 
 
-def test_a_fragment_that_begins_joined_is_merged_with_its_first_frame() -> None:
-    flight = ObservedFlight()
-    assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
-    outcome = flight.frame(m.Verdict.UNCONFIRMED, fragment=1, joined=True)
-    assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=1, file="0001.jpg", frames=1)]
-    assert flight.observer.completed().statistics["merged"] == 1
-
-
 def test_a_fragment_is_unanchored_then_matching_then_anchored_or_merged() -> None:
     flight, states = ObservedFlight(), []
-    steps = [(m.Verdict.UNCONFIRMED, m.SearchStep.NORMAL), (LOST, WIDEN), (m.Verdict.ACCEPTED, m.SearchStep.NORMAL)]
+    apart, skipped = (m.Verdict.UNCONFIRMED, m.SearchStep.NORMAL), (m.Verdict.BAD_IMAGE, m.SearchStep.SKIP)
+    steps = [apart, (LOST, WIDEN), apart, apart, apart, skipped, (m.Verdict.ACCEPTED, m.SearchStep.NORMAL)]
     for verdict, step in (*steps, (LOST, WHOLE)):
         outcome = flight.frame(verdict, step, joined=False)
         assert outcome.fragment is not None
         states.append(outcome.fragment.state)
-    assert states == ["unanchored", "matching", "anchored", "anchored"]
-    began = flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=False)
-    merged = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
-    changed = [*of_kind(began, FragmentChanged), *of_kind(merged, FragmentChanged)]
-    assert changed == [
-        FragmentChanged(fragment_id=1, frame_id=4, file="0004.jpg", state=FragmentState.UNANCHORED),
-        FragmentChanged(fragment_id=1, frame_id=5, file="0005.jpg", state=FragmentState.MERGED),
-    ]
-
-
-def test_a_search_is_a_recovery_that_starts_and_succeeds_once() -> None:
-    flight = ObservedFlight()
-    flight.frame(m.Verdict.ACCEPTED)
-    (started,) = of_kind(flight.frame(LOST, WIDEN), RecoveryStarted)
-    assert started == RecoveryStarted(frame_id=1, file="0001.jpg")
-    assert of_kind(flight.frame(LOST, ASK), RecoveryStarted, RecoverySucceeded) == []
-    (succeeded,) = of_kind(flight.frame(m.Verdict.ACCEPTED), RecoveryStarted, RecoverySucceeded)
-    assert succeeded == RecoverySucceeded(frame_id=3, file="0003.jpg", frames=2)
+    assert "".join(state[0] for state in states) == "umuumuaa"
 
 
 @pytest.mark.parametrize(("verdict", "kind"), [("accepted", UserFixApplied), ("innovation", VerdictGiven)])
@@ -198,26 +173,29 @@ def test_a_hint_that_is_accepted_ends_the_request_and_the_search_goes_on() -> No
     assert outcome.state is FlightState.RECOVERING and outcome.request is None
 
 
-def test_a_fragment_is_merged_once_when_it_is_joined() -> None:
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_fragment_is_merged_once_when_it_is_joined_or_begins_joined(frames: int) -> None:
     flight = ObservedFlight()
     assert of_kind(flight.frame(m.Verdict.ACCEPTED), ChunkMerged) == []
-    flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=False)
-    outcome = flight.frame(m.Verdict.ACCEPTED, fragment=1, joined=True)
-    assert of_kind(outcome, ChunkMerged) == [ChunkMerged(fragment_id=1, frame_id=2, file="0002.jpg", frames=2)]
-    assert outcome.fragment is not None and outcome.fragment.merged_at_frame == 2
+    for i in range(1, frames + 1):
+        outcome = flight.frame(m.Verdict.UNCONFIRMED, m.SearchStep.NEW_FRAGMENT, fragment=1, joined=i == frames)
+    at = {"fragment_id": 1, "frame_id": frames, "file": f"000{frames}.jpg"}
+    assert of_kind(outcome, ChunkMerged, FragmentChanged) == [
+        ChunkMerged(**at, frames=frames),
+        FragmentChanged(**at, state=FragmentState.MERGED),
+    ]
+    assert outcome.fragment is not None and outcome.fragment.merged_at_frame == frames
     assert of_kind(flight.frame(m.Verdict.ACCEPTED, fragment=1), ChunkMerged, FragmentChanged) == []
-    statistics = flight.observer.completed().statistics
-    assert (statistics["frames"], statistics["localised"], statistics["fragments"], statistics["merged"]) == (
-        4,
-        4,
-        2,
-        1,
-    )
+    counted = [flight.observer.completed().statistics[name] for name in ("frames", "localised", "fragments", "merged")]
+    assert counted == [frames + 2, frames + 2, 2, 1]
 
 
 def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> None:
     flight = ObservedFlight()
     flight.observer.hints[77], flight.observer.flight_id = 3, "f7"
+    pose = m.RefinedPose(frame_id=0, lat_deg=48.5, lon_deg=11.5, alt_amsl_m=600.0, sigma_e_m=2.0, sigma_n_m=1.0)
+    more = {"fragment_id": 3, "q_w_c": (1.0, 0.0, 0.0, 0.0), "cov": tuple(range(36)), "m_per_unit": 1.25}
+    whole = msgspec.structs.replace(pose, **more)
     flight.observer.take(
         [
             m.MeasurementVerdict(t_ns=0, frame_id=0, measurement="height", verdict=m.Verdict.IMPLAUSIBLE, detail="x"),
@@ -226,24 +204,7 @@ def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> 
             m.HintVerdict(
                 t_ns=0, hint_t_ns=77, verdict=m.Verdict.ACCEPTED, distance_m=3.21, sigma_m=1.0, text="agrees"
             ),
-            m.Refinement(
-                t_ns=0,
-                source=m.RefinementSource.SMOOTHER,
-                poses=[
-                    m.RefinedPose(
-                        frame_id=0,
-                        lat_deg=48.5,
-                        lon_deg=11.5,
-                        alt_amsl_m=600.0,
-                        sigma_e_m=2.0,
-                        sigma_n_m=1.0,
-                        fragment_id=3,
-                        q_w_c=(1.0, 0.0, 0.0, 0.0),
-                        cov=tuple(range(36)),
-                        m_per_unit=1.25,
-                    )
-                ],
-            ),
+            m.Refinement(t_ns=0, source=m.RefinementSource.SMOOTHER, poses=[whole]),
         ]
     )
     outcome = flight.frame(m.Verdict.ACCEPTED)
@@ -264,7 +225,6 @@ def test_rejections_answers_and_refined_positions_are_events_of_their_step() -> 
         WaypointsUpdated(frames=1, first_frame=0, last_frame=0, url="/flights/f7/waypoints")
     ]
     assert flight.observer.rest().events == []
-    pose = m.RefinedPose(frame_id=0, lat_deg=48.5, lon_deg=11.5, alt_amsl_m=600.0, sigma_e_m=2.0, sigma_n_m=1.0)
     flight.observer.take([m.Refinement(t_ns=1, poses=[pose])])
     (after_the_end,) = flight.observer.rest().refined
     assert after_the_end.m_per_unit == 1.25, "a refinement without a scale keeps the last one"

@@ -1,5 +1,6 @@
 """Requests to the console: what is taken, and what is refused with a problem that says why."""
 
+import json
 import random
 import socket
 import sqlite3
@@ -34,6 +35,9 @@ from terrafix_tools.installation import install_command
 def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
     with Console(settings(tmp_path_factory.mktemp("console"))) as running:
         yield running
+
+
+FORM = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
 
 
 def assert_refused(answer: Answer, status: int, *words: str) -> None:
@@ -84,7 +88,11 @@ def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
         ({"name": "x" * 101}, "name"),
         ({"height_m": "high"}, "height_m"),
         ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}]}}, "no map sources"),
-        ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 9, "lon": 9}]}}, "km2"),
+        # 1 degree is 111.32 km: (111.32 + 19) * 19
+        (
+            {"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}], "corridor_m": 9500}},
+            "2476 km2",
+        ),
     ],
 )
 def test_a_flight_that_is_not_valid_is_refused_with_the_field(
@@ -99,18 +107,11 @@ def test_images_become_frames_in_the_order_of_their_names_over_batches_whatever_
 ) -> None:
     flight_id = console.create()
     first = console.upload(flight_id, batch(20))
-    assert (first.status, first.json) == (
-        202,
-        {"frames": [*range(10)], "repeated": False},
-    )
+    assert (first.status, first.json) == (202, {"frames": [*range(10)], "repeated": False})
     assert_refused(console.upload(flight_id, batch(5, 12)), 409, "IMG_0005.jpg", "IMG_0029.jpg")
     assert console.upload(flight_id, batch(98, 12)).json["frames"] == [*range(10, 22)]
-    assert console.send("GET", f"/flights/{flight_id}").json["images"] == {
-        "uploaded": 22,
-        "processed": 0,
-        "expected": None,
-        "last_name": "IMG_0109.jpg",
-    }
+    images = {"uploaded": 22, "processed": 0, "expected": None, "last_name": "IMG_0109.jpg"}
+    assert console.send("GET", f"/flights/{flight_id}").json["images"] == images
     image = console.send("GET", f"/flights/{flight_id}/frames/11/image")
     assert image.body == jpeg(99) and image.headers["content-type"] == "image/jpeg"
     assert image.headers["x-content-type-options"] == "nosniff"
@@ -146,6 +147,7 @@ def test_a_batch_that_is_sent_again_has_the_same_frames_and_is_not_stored_twice(
         ([*batch(1, 9), ("images", "IMG_0010.png", png_header(6253, 4168))], 422, "6253x4168"),
         ([*batch(1, 9), ("images", "IMG_0010.jpg", jpeg(0, 800, 600))], 422, "the camera of this flight has 640x480"),
         ([*batch(1, 10), ("other", "x", b"")], 422, "'other'"),
+        ([("other", "x", b""), ("images", "IMG_0001.jpg", b"x" * 20_000_000)], 422, "'other'"),  # refused early
         ([*batch(1, 10), ("telemetry", "t.csv", b"file,t_s\nIMG_0001.jpg,0\n")], 422, "one row for each image"),
         ([*batch(1, 10), ("telemetry", "t.csv", b"file,t_s\nIMG_0001.jpg,zero\n")], 422, "telemetry row 2"),
     ],
@@ -162,27 +164,24 @@ def test_a_batch_that_is_not_valid_is_refused_as_a_whole(
 
 def test_a_body_that_is_no_multipart_or_is_cut_is_refused(console: Console) -> None:
     path = f"/flights/{console.create()}/images/batch"
-    kind = {"content-type": "multipart/form-data; boundary=a-boundary-of-the-test"}
     whole = multipart(batch(1))
     assert_refused(console.send("POST", path, whole, {"content-type": "image/jpeg"}), 415)
-    assert_refused(console.send("POST", path, whole[:-30], kind), 422, "ends too early")
-    assert_refused(console.send("POST", path, b"no parts", kind), 422)
-    assert_refused(console.send("POST", path, b"", kind), 422)
+    assert_refused(console.send("POST", path, whole[:-30], FORM), 422, "ends too early")
+    assert_refused(console.send("POST", path, b"no parts", FORM), 422)
+    assert_refused(console.send("POST", path, b"", FORM), 422)
 
 
 @pytest.mark.parametrize("head", [b"X: " + b"a" * 5000 + b"\r\n", b"X: a\r\n" * 9, b"X" * 100_000])
 def test_a_part_with_too_many_or_too_long_headers_is_refused(console: Console, head: bytes) -> None:
     path = f"/flights/{console.create()}/images/batch"
-    kind = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
     body = b"--" + BOUNDARY.encode() + b"\r\n" + head
-    assert_refused(console.send("POST", path, body, kind), 422, "eader")
+    assert_refused(console.send("POST", path, body, FORM), 422, "eader")
 
 
 def test_names_and_tokens_beyond_latin_1_are_no_failure_of_the_service(console: Console) -> None:
-    kind = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
     path = f"/flights/{console.create()}/images/batch"
     body = multipart([("\u6c34", "IMG_0001.jpg", jpeg())])
-    assert_refused(console.send("POST", path, body, kind), 422)
+    assert_refused(console.send("POST", path, body, FORM), 422)
     answer = console.send("POST", "/session", {"token": "\u6c34"})
     assert (answer.status, answer.json["required"]) == (200, False)
     assert "set-cookie" not in answer.headers
@@ -196,11 +195,6 @@ def test_an_image_whose_file_is_gone_is_not_found(console: Console) -> None:
     for file in console.service.settings.flight(flight_id).rglob("*.jpg"):
         file.unlink()
     assert_refused(console.send("GET", path), 404)
-
-
-def test_a_large_upload_that_is_refused_early_still_gets_its_answer(console: Console) -> None:
-    parts = [("other", "x", b""), ("images", "IMG_0001.jpg", b"x" * 20_000_000)]
-    assert_refused(console.upload(console.create(), parts), 422, "'other'")
 
 
 def test_times_and_states_of_a_table_are_those_of_the_images(console: Console) -> None:
@@ -237,11 +231,8 @@ def test_a_fix_needs_a_frame_and_hints_are_numbered(console: Console) -> None:
     assert console.send("POST", f"/flights/{flight_id}/hint", {"lat": 1.0, "lon": 2.0}).json["hint_id"] == 2
     outside = {**fix, "pixel": {"u": 640, "v": 20}}
     assert_refused(console.send("POST", f"/flights/{flight_id}/user-fix", outside), 422, "640x480")
-    assert_refused(
-        console.send("POST", f"/flights/{flight_id}/frames/3/object-to-gps", {"pixel_x": 1, "pixel_y": 1}),
-        404,
-        "no result of frame 3",
-    )
+    asked = console.send("POST", f"/flights/{flight_id}/frames/3/object-to-gps", {"pixel_x": 1, "pixel_y": 1})
+    assert_refused(asked, 404, "no result of frame 3")
 
 
 def test_maps_have_bounds_and_tiles(console: Console) -> None:
@@ -262,6 +253,8 @@ def test_errors_of_http_itself_are_problems_too(console: Console) -> None:
     assert_refused(console.send("POST", "/flights", b"{not json", {"content-type": "application/json"}), 422)
     assert_refused(console.send("POST", "/flights", b"[" * 100_000, {"content-type": "application/json"}), 400)
     assert_refused(console.send("POST", "/flights", b" " * 3_000_000, {"content-type": "application/json"}), 413)
+    chunks = iter([b" " * console.service.settings.limits.body_bytes, json.dumps(NEW).encode()])
+    assert_refused(console.send("POST", "/flights", chunks, {"content-type": "application/json"}), 400)
     assert_refused(console.send("GET", "/flights/UPPER"), 422)
     assert console.send("GET", "/page/..%2f..%2fcli.py").status == 404
 
@@ -353,25 +346,30 @@ def test_without_the_console_extra_one_line_states_what_to_install(tmp_path: Pat
     assert done.stderr == f"terrafix: this command needs fastapi; install it: {install_command('console')}\n"
 
 
+@pytest.mark.parametrize(("second", "begin_s"), [(40, 40.0), (3, 10.0)])
+def test_a_further_batch_begins_when_its_camera_says_or_later(console: Console, second: int, begin_s: float) -> None:
+    flight_id = console.create()
+    for first, at in ((0, 0), (10, second)):
+        parts = [("images", f"IMG_{first + i:04d}.jpg", photo(at + i)) for i in range(10)]
+        assert console.upload(flight_id, parts).status == 202
+    with console.service.database.read() as db:
+        assert flights.images_of(db, flight_id, 10, 1)[0].t_ns == begin_s * 1e9
+
+
 def facts(console: Console, parts: list[tuple[str, str, bytes]]) -> Answer:
-    kind = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
-    return console.send("POST", "/photos", multipart(parts), kind)
+    return console.send("POST", "/photos", multipart(parts), FORM)
 
 
 def test_photos_state_what_replay_takes_from_them_and_where_it_comes_from(console: Console) -> None:
-    heads = [
-        ("images", f"DJI_{i:04d}.JPG", photo(i, 23.5, 121.0)[:-2000]) for i in (3, 9)
-    ]  # their first bytes are enough
+    # Their first bytes are enough.
+    heads = [("images", f"DJI_{i:04d}.JPG", photo(i, 23.5, 121.0)[:-2000]) for i in (3, 9)]
     found = facts(console, heads).json
     assert (found["width"], found["height"]) == (640, 480)
     assert found["camera"]["fx"] == pytest.approx(24 / 43.267 * 800, rel=1e-3)
     assert (found["start"]["lat"], found["start"]["lon"]) == (23.5, 121.0)
     assert (found["height_m"], found["yaw_deg"], found["mount"]["tolerance_deg"]) == (92.4, 91.0, 9.0)
     said = {fact["topic"]: fact["text"] for fact in found["facts"]}
-    assert (
-        "FocalLengthIn35mmFilm" in " ".join(f["text"] for f in found["facts"])
-        and "GPS of the first photo" in said["start"]
-    )
+    assert "FocalLengthIn35mmFilm" in str(found["facts"]) and "GPS of the first photo" in said["start"]
     assert "RelativeAltitude" in said["height"] and "DateTimeOriginal of 2 of 2" in said["clock"]
     table = b"name = 'field'\nmap = 'maps/town.gpkg'\n[camera]\nwidth=640\nheight=480\nfx=500\nfy=500\ncx=320\ncy=240\n"
     described = facts(console, [*heads, ("description", "flight.toml", table)]).json

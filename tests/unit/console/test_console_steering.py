@@ -58,13 +58,19 @@ def test_a_fix_is_carried_on_by_odometry_within_a_fragment_and_grows_old_without
     assert ORIGIN.to_local(left.lat_deg, left.lon_deg) == pytest.approx(TRUE_M, abs=0.05)
 
 
-def test_without_uncertainty_of_the_attitude_the_radius_is_that_of_the_place() -> None:
-    cov = np.zeros((6, 6))
-    sure = msgspec.structs.replace(turned(estimate(0, 0.0, 0.0)), cov=tuple(cov.ravel().tolist()))
-    message = fix_message(fix(TRUE_M), pixel_of(sure, TRUE_M), CAMERA, {0: sure}, 0)
-    assert message is not None and message.radius_m == pytest.approx(SIGMAS_95 * FIX_SIGMA_M)
-    stated = fix_message(fix(TRUE_M).model_copy(update={"sigma_m": 2.0}), pixel_of(sure, TRUE_M), CAMERA, {0: sure}, 0)
-    assert stated is not None and stated.sigma_m == pytest.approx(2.0)
+def test_an_error_of_the_tilt_moves_the_place_by_the_height_and_one_of_the_heading_by_the_distance() -> None:
+    level = msgspec.structs.replace(estimate(0, 0.0, 0.0), q_w_b=quat_from_rot(rot_w_b(0.0, 0.0, 0.0)))
+    place_m = TRUE_M + np.array([60.0, 80.0])
+    for update, variances, moved_m in (
+        ({}, (0.0, 0.0, 0.0), 0.0),
+        ({"sigma_m": 2.0}, (1e-4, 4e-4, 0.0), 100.0 * 0.02 * 2.0),
+        ({}, (0.0, 0.0, 1e-4), 100.0 * 0.01),
+    ):
+        seen = msgspec.structs.replace(level, cov=tuple(np.diag([0.0, 0.0, 0.0, *variances]).ravel().tolist()))
+        given = fix(place_m).model_copy(update=update)
+        message = fix_message(given, pixel_of(seen, place_m), CAMERA, {0: seen}, 0)
+        expected_m = math.hypot(update.get("sigma_m", FIX_SIGMA_M), moved_m)
+        assert message is not None and message.sigma_m == pytest.approx(expected_m, rel=1e-3)
 
 
 def test_a_frame_without_attitude_and_a_pixel_of_the_sky_give_no_position() -> None:

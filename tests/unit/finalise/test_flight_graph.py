@@ -1,11 +1,13 @@
 """Batch smoother after landing: accuracy, consistency, and rejection of outlier map matches."""
 
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import msgspec
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import M
 
 from map_matches import with_search
 from recorded_flight import blind_between, errors, replayed_graph, shifted, unmatched
@@ -15,10 +17,12 @@ from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.estimator.models.lens_prior import principal_point_sigma
 from terrafix.messages import MapMatch, Message, SearchResult, Verdict
+from terrafix.smoother.gnc import solve
 from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.fix_consistency import lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer
+from terrafix_tools.finalise.submaps import _submap
 from terrafix_tools.score import nees_of
 
 FAR_M = (350.0, -200.0)
@@ -97,6 +101,39 @@ def test_map_matches_over_the_same_ground_count_with_their_share(monkeypatch: py
     monkeypatch.setattr(batch_smoother, "information_shares", lambda flight: [0.2] * len(flight.fixes))
     shared = smooth(graph)
     assert np.trace(shared.covs[-1]) > 1.2 * np.trace(alone.covs[-1])
+
+
+def test_a_map_match_that_agrees_with_the_solution_is_readmitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_the_first(*given: Any) -> tuple[gtsam.Values, np.ndarray]:
+        values, inliers = solve(*given)
+        return values, inliers & (np.arange(len(inliers)) > 0)
+
+    monkeypatch.setattr(batch_smoother, "solve", without_the_first)
+    assert smooth(replayed_graph(Flight(12, seed=4, fix_every=3))).inliers.all()
+
+
+@pytest.mark.parametrize(("learnt", "factors"), [(1.0, 1), (0.5, 2)])
+def test_a_learnt_height_scale_is_the_sum_of_barometer_and_focal_length(learnt: float, factors: int) -> None:
+    graph = replayed_graph(Flight(2, seed=4))
+    first, smoothing = graph.recorder.nodes[0], batch_smoother._Smoothing(graph, lambda _done, _of: None)
+    assert first.calibration is not None
+    first.calibration = first.calibration[0], learnt * first.calibration[1]
+    smoothing._sees_lens = True
+    assert len(list(smoothing._calibration_factors(0, first))) == factors
+
+
+def test_a_start_has_the_offset_of_the_map_that_most_matches_use() -> None:
+    graph = replayed_graph(Flight(12, seed=4, fix_every=3))
+    graph.fixes[0] = replace(graph.fixes[0], map_sigma_m=99.0)
+    assert batch_smoother._Smoothing(graph, lambda _done, _of: None)._start_factor(0).factor.keys()[0] == M(0)
+
+
+def test_an_error_of_the_height_is_the_scale_of_a_segment_and_not_of_its_steps() -> None:
+    first, node = replayed_graph(Flight(2, seed=4)).recorder.nodes
+    assert node.motion is not None and node.motion.rays is not None
+    ground, step_m = node.motion.rays.ground, node.motion.r.T @ node.motion.p_m
+    left = node.motion.cov - _submap([first, node], 0, 0.1).step_cov[1]
+    assert np.trace(left) == pytest.approx(step_m @ step_m * (ground.height_sigma_m / ground.height_m) ** 2)
 
 
 def test_a_blackout_is_interpolated_from_both_sides() -> None:
@@ -216,7 +253,7 @@ def test_consistent_outliers_at_the_end_widen_the_covariance_over_both_positions
     graph = replayed_graph(flight, alter)
     smoothed = smooth(graph)
     errors_m, covs = errors(flight, graph, smoothed)
-    assert np.all(nees_of(errors_m, covs)[75:] < 9.21) and covs[80, 0, 0] > 30.0**2
+    assert np.all(nees_of(errors_m, covs)[75:] < 9.21) and covs[80, 0, 0] > 30.0**2 > 10.0**2 > covs[40, 0, 0]
 
 
 def test_a_record_with_two_origins_gives_two_flights() -> None:

@@ -56,6 +56,7 @@ def test_a_focal_length_that_is_3_percent_off_is_found() -> None:
     covs = [tangent_to_world(at.cov, at.pose.rotation().matrix()) for at in placed.values()]
     sigma_m = np.sqrt(np.mean([cov[2, 2] for cov in covs]))
     assert np.sqrt(np.mean(up_m**2)) < 3.0 * sigma_m  # in heights as seen it would be 3 % of 176 m
+    assert sigma_m > 176.0 * found.lens_sigma.log_focal  # no height is known better than the focal length
 
 
 def test_heights_as_seen_through_the_described_lens_have_its_share_of_the_height() -> None:

@@ -96,7 +96,7 @@ def test_rays_that_meet_at_a_small_angle_give_no_point(angle: float, count: int)
 def test_a_wrong_match_and_a_point_behind_the_camera_are_left_out() -> None:
     cameras = {0: camera_at(0.0, 0.0), 1: camera_at(20.0, 0.0)}
     frame = seen(cameras[1])
-    frame[2, 1] += 10 * SIGMA  # across the motion: the rays do not meet
+    frame[2, 1] += 6 * SIGMA  # across the motion: the rays do not meet, by three sigma each
     frame[5, 0] = seen(cameras[0])[5, 0] + 0.1  # against the motion: they meet above the cameras
     tracks = FeatureTracks()
     tracks.add(odometry(1, seen(cameras[0]), frame))

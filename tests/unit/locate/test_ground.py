@@ -9,8 +9,9 @@ import pytest
 import pointed_flight as rig
 from flight_records import write_record
 from terrafix import messages as m
-from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import SourceError
+from terrafix_tools.console.compute.locating import Locators
+from terrafix_tools.console.locating import Question
 from terrafix_tools.finalise.point_cloud import POINTS, VERTEX, write_ply
 from terrafix_tools.finalised import write
 from terrafix_tools.locate.cloud import PointCloud, build_cloud
@@ -25,17 +26,7 @@ OBLIQUE = np.array([0.6, 0.0, -0.8])
 
 def view() -> CameraView:
     """100 m above ground of 500 m, at east 0, north 0."""
-    return CameraView(
-        frame_id=3,
-        file="",
-        t_ns=0,
-        p_c_in_w_m=np.array([0.0, 0.0, 600.0]),
-        r_w_c=rig.r_w_c(),
-        cov=np.eye(6),
-        calibration=CameraCalibration.of(rig.CAMERA),
-        ground_m=500.0,
-        fragment_id=0,
-    )
+    return rig.view(0, np.eye(6))
 
 
 def hit(patch: GroundPatch, ray: np.ndarray) -> np.ndarray:
@@ -93,19 +84,13 @@ def test_slope_under_points_is_that_of_the_elevation() -> None:
     patch = ground_patch(view(), DOWN, rising, lambda e_m, n_m: 500.0 + 0.2 * e_m)
     assert patch.surface is Surface.POINTS and patch.slope == pytest.approx([0.2, 0.0])
     assert hit(patch, DOWN)[2] == pytest.approx(512.0)
-    assert patch.sigma_m == pytest.approx(np.hypot(1.2, 1.0))
+    assert patch.sigma_m == pytest.approx(0.2 / np.sqrt(12))  # the points agree: the error of their mean
+    assert patch.level_sigma_m == pytest.approx(np.hypot(1.2, 1.0))  # the level is that of the elevation
 
 
 def test_where_the_elevation_is_unknown_the_plane_is_used() -> None:
     patch = ground_patch(view(), OBLIQUE, EMPTY, lambda e_m, _n_m: np.where(e_m < 40.0, 500.0, np.nan))
     assert patch.surface is Surface.PLANE
-
-
-def test_points_about_the_end_of_the_ray_come_before_the_elevation() -> None:
-    patch = ground_patch(view(), DOWN, around(0.0, 512.0), lambda e_m, _n_m: 500.0 + 0.0 * e_m)
-    assert patch.surface is Surface.POINTS
-    assert hit(patch, DOWN) == pytest.approx([0.0, 0.0, 512.0])
-    assert patch.sigma_m == pytest.approx(np.hypot(1.2, 1.0))  # the points agree: the level is that of the elevation
 
 
 def test_ray_is_followed_to_the_points_where_they_stand_above_the_elevation() -> None:
@@ -119,8 +104,16 @@ def test_points_that_do_not_lie_in_a_plane_widen_the_height() -> None:
     rough = PointCloud(cloud.points_m + np.array([0.0, 0.0, 1.0]) * np.tile([3.0, -3.0], 6)[:, None], cloud.sigma_m)
     patch = ground_patch(view(), DOWN, rough, None)
     departure_m2 = 9.0 * 12 / 11  # of 12 points about their mean
-    expected = np.sqrt(departure_m2 * (1.0 + 1.0 / 12) + 1.2**2 + 2.0**2)
-    assert patch.sigma_m == pytest.approx(expected)
+    assert patch.sigma_m == pytest.approx(np.sqrt((departure_m2 - 0.2**2) * (1.0 + 1.0 / 12) + 0.2**2 / 12))
+
+
+def test_errors_of_the_points_are_not_relief() -> None:
+    cloud = around(0.0, 500.0, sigma_m=3.0)
+    noise_m = np.random.default_rng(2).normal(0.0, 3.0, 12)
+    patch = ground_patch(
+        view(), DOWN, PointCloud(cloud.points_m + noise_m[:, None] * [0.0, 0.0, 1.0], cloud.sigma_m), None
+    )
+    assert 0.5 * 3.0 / np.sqrt(12) < patch.sigma_m < 2.0 * 3.0 / np.sqrt(12)
 
 
 def test_points_behind_the_camera_are_not_below_it() -> None:
@@ -150,12 +143,12 @@ def test_beside_the_points_the_ground_may_be_theirs_or_that_without_them() -> No
 
 def test_points_aside_of_the_pixel_tell_less_by_the_error_of_the_slope() -> None:
     aside = ground_patch(view(), DOWN, around(18.0, 500.0), None)
-    assert aside.sigma_m == pytest.approx(np.linalg.norm([1.2, 2.0, 0.03 * aside.at_m[0], 0.03 * 18.0]), rel=1e-3)
+    assert aside.sigma_m == pytest.approx(np.hypot(0.03 * 18.0, 0.2 / np.sqrt(12)), rel=1e-3)
 
 
 @pytest.mark.parametrize("up", [0.5, 0.0, -0.04])
 def test_pixel_of_horizon_or_sky_is_refused(up: float) -> None:
-    with pytest.raises(SourceError, match="frame 3: the pixel shows no ground"):
+    with pytest.raises(SourceError, match="frame 0: the pixel shows no ground"):
         ground_patch(view(), np.array([np.sqrt(1.0 - up**2), 0.0, up]), EMPTY, None)
 
 
@@ -167,6 +160,7 @@ def test_cloud_of_a_flight_has_ground_and_house(tmp_path: Path) -> None:
     assert len(cloud.points_m) > 2000 and on_house.sum() > 50
     assert np.abs(cloud.points_m[:, 2] - true_m).max() < 0.05
     assert cloud.sigma_m.min() > 0.0 and cloud.sigma_m.max() < 2.0
+    assert len(build_cloud(flight, 1, None).points_m) == 0, "of another fragment"
 
 
 def test_cloud_has_the_level_of_the_elevation(tmp_path: Path) -> None:
@@ -174,11 +168,6 @@ def test_cloud_has_the_level_of_the_elevation(tmp_path: Path) -> None:
     cloud = build_cloud(flight, 0, lambda e_m, _n_m: np.full(e_m.shape, 503.0))
     away = np.abs(cloud.points_m[:, 0] - rig.HOUSE_E_M) > 25.0
     assert np.median(cloud.points_m[away, 2]) == pytest.approx(503.0, abs=0.05)
-
-
-def test_cloud_of_another_fragment_is_empty(tmp_path: Path) -> None:
-    flight = read_views(rig.write_flight(tmp_path / "flight.mcap"))
-    assert len(build_cloud(flight, 1, None).points_m) == 0
 
 
 def test_the_points_of_a_finalised_flight_are_used_whatever_their_fragment(tmp_path: Path) -> None:
@@ -189,11 +178,12 @@ def test_the_points_of_a_finalised_flight_are_used_whatever_their_fragment(tmp_p
     points["fragment"] = 7
     write_ply(tmp_path / POINTS, points, rig.ORIGIN)
     write_record(tmp_path / "flight.mcap", [x for x in rig.messages() if not getattr(x, "three_view", None)])
-    roof = ("3", rig.pixel(3, np.array([rig.HOUSE_E_M, 0.0, rig.START_AMSL_M + rig.HOUSE_M])))
-    assert FlightLocator.open(tmp_path).locate([roof]).surface is Surface.PLANE
+    roof = rig.pixel(3, np.array([rig.HOUSE_E_M, 0.0, rig.START_AMSL_M + rig.HOUSE_M]))
+    locators, question = Locators(), Question(str(tmp_path), "", [(3, roof)])
+    assert locators.answer(question).surface == "plane"
     write(tmp_path, [], {"flights": [{"solution": "refined"}]})
-    found = FlightLocator.open(tmp_path).locate([roof])
-    assert found.surface is Surface.POINTS and found.p_m[2] == pytest.approx(512.0, abs=0.2)
+    found = locators.answer(question)
+    assert found.surface == "points" and found.alt_amsl_m == pytest.approx(512.0, abs=0.2)
     (tmp_path / POINTS).write_bytes(b"ply")
     with pytest.raises(SourceError, match=r"points\.ply: cannot be read"):
         FlightLocator.open(tmp_path)

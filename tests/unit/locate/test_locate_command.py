@@ -50,9 +50,7 @@ def test_json_has_position_accuracy_surface_and_sightings(record: Path) -> None:
     assert (values["lat_deg"], values["lon_deg"]) == pytest.approx((lat_deg, lon_deg), abs=5e-6)
     assert values["alt_amsl_m"] == pytest.approx(500.0, abs=0.3)
     found = FlightLocator.open(record).locate([("2", rig.pixel(2, FIELD_M))])
-    assert values["sigma_e_m"] ** 2 == pytest.approx(found.cov[0, 0], rel=1e-2)
-    assert values["sigma_n_m"] ** 2 == pytest.approx(found.cov[1, 1], rel=1e-2)
-    assert values["sigma_u_m"] ** 2 == pytest.approx(found.cov[2, 2], rel=1e-2)
+    assert [values[f"sigma_{axis}_m"] ** 2 for axis in "enu"] == pytest.approx(found.cov.diagonal(), rel=1e-2)
     assert values["cov_en_m2"] == pytest.approx(found.cov[0, 1], abs=1e-4)
     assert values["radius95_m"] == pytest.approx(found.radius95_m, abs=1e-3)
     assert values["surface"] == "points" and values["consistent"] is True

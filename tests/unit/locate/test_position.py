@@ -6,32 +6,17 @@ import numpy as np
 import pytest
 
 import pointed_flight as rig
-from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.pose import exp_so3
 from terrafix_tools.locate.ground import GroundPatch, Surface
 from terrafix_tools.locate.position import CHI2_999, Pixel, check_pixel, locate_object
-from terrafix_tools.locate.views import CameraView
 
+SMALL = np.diag([1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4])
 MAST_M = np.array([50.0, 10.0, 520.0])  # top of a mast above ground of 500 m
 
 
-def view(i: int, cov: np.ndarray | None = None) -> CameraView:
-    return CameraView(
-        frame_id=i,
-        file="",
-        t_ns=0,
-        p_c_in_w_m=rig.camera_m(i),
-        r_w_c=rig.r_w_c(),
-        cov=np.diag([1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4]) if cov is None else cov,
-        calibration=CameraCalibration.of(rig.CAMERA),
-        ground_m=500.0,
-        fragment_id=0,
-    )
-
-
 def at(i: int, point_m: np.ndarray, cov: np.ndarray | None = None) -> Pixel:
-    return Pixel(view(i, cov), *rig.pixel(i, point_m))
+    return Pixel(rig.view(i, SMALL if cov is None else cov), *rig.pixel(i, point_m))
 
 
 def level(sigma_m: float, surface: Surface = Surface.PLANE, up_m: float = 500.0) -> GroundPatch:
@@ -71,14 +56,26 @@ def test_radius_is_the_longer_half_axis_of_the_95_percent_ellipse() -> None:
     assert found.radius95_m == pytest.approx(np.sqrt(5.991 * (9.0 + pixel_m**2)), rel=1e-3)
 
 
-def test_several_pixels_find_the_height_of_what_stands_above_the_ground() -> None:
+@pytest.mark.parametrize("sigma_m", [30.0, 0.2])
+def test_several_pixels_find_the_height_of_what_stands_above_the_ground(sigma_m: float) -> None:
     small = np.diag([0.01, 0.01, 0.01, 1e-8, 1e-8, 1e-8])
     pixels = [at(i, MAST_M, small) for i in (0, 2, 4)]
-    found = locate_object(pixels, [level(30.0)] * 3)
+    found = locate_object(pixels, [level(sigma_m)] * 3)
     assert found.p_m == pytest.approx(MAST_M, abs=0.3)
     assert found.cov[2, 2] < 4.0
     alone = locate_object(pixels[:1], [level(30.0)])
     assert np.hypot(*(alone.p_m - MAST_M)[:2]) > 5.0 and alone.cov[2, 2] == pytest.approx(900.0, rel=1e-3)
+
+
+def test_a_height_that_the_pixels_do_not_determine_is_that_of_the_ground() -> None:
+    above = np.array([30.0, 10.0, 505.0])  # two cameras 20 m apart know the height to 14 m
+    assert locate_object([at(0, above), at(1, above)], [level(0.2)] * 2).p_m[2] == pytest.approx(500.0, abs=0.1)
+
+
+def test_level_of_camera_and_ground_is_in_the_height_and_not_in_the_position() -> None:
+    point = np.array([60.0, 0.0, 500.0])
+    one, other = (locate_object([at(0, point)], [replace(level(0.3), level_sigma_m=s)]).cov for s in (0.0, 2.0))
+    assert other - one == pytest.approx(np.diag([0.0, 0.0, 4.0]))
 
 
 def test_pixels_of_one_flight_do_not_average_their_errors_away() -> None:
@@ -100,13 +97,6 @@ def test_most_exact_ground_of_the_first_kind_counts() -> None:
     assert found.p_m == pytest.approx(point, abs=1e-6)
 
 
-def test_pixels_of_two_objects_are_not_consistent() -> None:
-    here, there = np.array([30.0, 0.0, 500.0]), np.array([30.0, 25.0, 500.0])
-    found = locate_object([at(1, here), at(2, here), at(2, there)], [level(1.0)] * 3)
-    assert not found.consistent and int(np.argmax(found.test_ratios)) == 2
-    assert locate_object([at(1, here), at(2, here)], [level(1.0)] * 2).consistent
-
-
 def test_test_ratio_is_the_squared_mahalanobis_distance_over_its_gate() -> None:
     point, cov = np.array([0.0, 0.0, 500.0]), np.diag([4.0, 4.0, 1e-9, 1e-12, 1e-12, 1e-12])
     first = at(0, point + np.array([3.0, 0.0, 0.0]), cov)
@@ -119,9 +109,9 @@ def test_test_ratio_is_the_squared_mahalanobis_distance_over_its_gate() -> None:
 @pytest.mark.parametrize(("u", "v"), [(-0.6, 10.0), (10.0, -0.6), (799.6, 10.0), (10.0, 599.6)])
 def test_pixel_outside_the_frame_is_refused(u: float, v: float) -> None:
     with pytest.raises(UsageError, match=r"outside the frame, which has 800 x 600 pixels"):
-        check_pixel(Pixel(view(0), u, v))
+        check_pixel(Pixel(rig.view(0, SMALL), u, v))
 
 
 @pytest.mark.parametrize(("u", "v"), [(-0.5, -0.5), (799.5, 599.5)])
 def test_pixel_at_the_border_is_in_the_frame(u: float, v: float) -> None:
-    check_pixel(Pixel(view(0), u, v))
+    check_pixel(Pixel(rig.view(0, SMALL), u, v))

@@ -2,6 +2,7 @@
 
 import gc
 import tracemalloc
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from terrafix.smoother import keyframe_graph
 from terrafix.smoother.keyframe_graph import LONE_FRAMES, Anchor, FrameNode, Join, KeyframeGraph, with_scale
-from terrafix.smoother.solution import followers, solve
+from terrafix.smoother.solution import _submap, followers, solve
 
 COV = np.diag([0.002, 0.002, 0.002, 0.1, 0.1, 0.1]) ** 2
 ANCHOR_COV = np.diag([0.01, 0.01, 0.01, 1.0, 1.0, 1.0]) ** 2
@@ -45,6 +46,7 @@ def test_keyframes_are_bounded_and_what_hung_on_one_that_goes_keeps_its_pose_and
             expected = world(frame.parent).between(world(i))
             assert np.allclose(frame.between.matrix(), expected.matrix(), atol=1e-9)
             assert frame.walk2 == pytest.approx(1e-6 * (i - frame.parent))
+            assert _submap(graph, [frame.parent, i]).scale_walk[1] ** 2 == pytest.approx(frame.walk2)
             assert frame.cov[5, 5] == pytest.approx(COV[5, 5] * (i - frame.parent), rel=0.1)
 
 
@@ -65,10 +67,12 @@ def test_a_map_match_of_a_frame_that_is_no_keyframe_places_its_keyframe() -> Non
 
 def test_map_matches_of_one_keyframe_that_agree_count_as_one_with_their_information() -> None:
     graph = chain(3)
-    for _ in range(4):
-        graph.add_anchor(1, Anchor(world(1), ANCHOR_COV))
+    for aside_m in (0.6, -0.6, 0.6, -0.6):
+        aside = gtsam.Pose3(gtsam.Rot3(), np.array([aside_m, 0.0, 0.0]))
+        graph.add_anchor(1, Anchor(world(1).compose(aside), ANCHOR_COV))
     (anchor,) = graph.anchors[1]
     assert np.allclose(anchor.cov, ANCHOR_COV / 4.0)
+    assert np.allclose(anchor.pose.translation(), world(1).translation(), atol=1e-3)
 
 
 def test_map_matches_of_one_keyframe_that_contradict_each_other_are_kept_apart_up_to_three() -> None:
@@ -142,6 +146,15 @@ def test_a_relocalisation_between_frames_is_one_between_their_keyframes() -> Non
         uncertain.append(graph.on_keyframes(Join(20, 21, between, COV, 0.01)))
         graph.frames[frame_id].cov = COV
     assert all(np.trace(one.cov) > 10.0 * np.trace(join.cov) for one in uncertain if one is not None), "of all three"
+
+
+def test_trees_whose_only_relocalisation_is_wrong_are_not_placed_by_their_starts() -> None:
+    graph = KeyframeGraph()
+    for start in (0, 10):
+        graph.add_start(replace(node(start, between=world(start)), cov=1e-4 * np.eye(6)))
+        graph.add_link(node(start + 1, start))
+    graph.add_join(Join(0, 10, gtsam.Pose3(gtsam.Rot3(), np.array([300.0, 0.0, 0.0])), COV, 0.01))
+    assert solve(graph) == {}
 
 
 def test_a_tree_that_cannot_be_solved_does_not_keep_others_from_it() -> None:

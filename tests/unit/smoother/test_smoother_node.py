@@ -15,7 +15,7 @@ from terrafix.core.node import NodeContext
 from terrafix.core.pose import log_so3
 from terrafix.messages import RefinementSource
 from terrafix.smoother.keyframe_graph import KeyframeGraph
-from terrafix.smoother.node import MAX_POSES, SmootherNode, make_node
+from terrafix.smoother.node import KNOWN_HEIGHT_WALK, MAX_POSES, SmootherNode, make_node
 
 LAP = 80  # frames
 
@@ -196,6 +196,23 @@ def test_a_map_match_that_moves_nothing_waits_and_one_that_moves_the_past_does_n
     assert track.error_m(30) < 2.5
 
 
+@pytest.mark.parametrize(("matches", "solves"), [(1, False), (2, True)])
+def test_map_matches_that_move_the_past_a_little_each_move_it_together(matches: int, solves: bool) -> None:
+    track = Track()
+    track.fly(0, 10)
+    track.feed([track.anchor(0), track.anchor(9), track.prediction(10)])
+    count = len(track.published)
+    track.fly(10, 12, goes_on=True)
+    track.feed([*(track.anchor(i, (0.52, 0.0)) for i in range(10, 10 + matches)), track.prediction(12)])
+    assert (len(track.published) > count) is solves
+
+
+def test_the_scale_walks_from_frame_to_frame_to_a_keyframe() -> None:
+    track = Track(smoother=SmootherNode(graph=(graph := KeyframeGraph())))
+    track.feed([track.prediction(0), track.prediction(7), track.link(7, 0)])
+    assert graph.frames[7].walk2 == pytest.approx(7 * KNOWN_HEIGHT_WALK**2)
+
+
 def test_a_restarted_smoother_goes_on_with_the_frames_after_its_start() -> None:
     track = Track()
     track.fly(0, 20)
@@ -235,13 +252,6 @@ def test_nothing_is_solved_while_the_computer_is_hot_and_all_is_afterwards() -> 
     assert len(track.published) == before
     track.feed([track.anchor(9), track.prediction(31)])
     assert set(track.refined) >= set(range(9))
-
-
-def test_a_smoother_that_is_switched_off_publishes_nothing() -> None:
-    track = Track(smoother=SmootherNode(enabled=False))
-    track.fly(0, 10)
-    track.feed([track.anchor(0), track.anchor(9), track.prediction(10)])
-    assert track.published == []
 
 
 def test_the_same_messages_give_the_same_refinements() -> None:

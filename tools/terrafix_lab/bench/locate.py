@@ -5,8 +5,8 @@ python -m terrafix_lab.bench.locate OUT [--seed S] [--size-km KM] [--agl M] [--v
 
 A flight is simulated into OUT/flight and replayed into OUT/replay, unless they are there. Random pixels of random
 frames with a position are located, and compared with the intersection of the true ray and the true ground. The map of
-a simulated flight is exact, while its package states an error: the figures are given for the exact map, and for a map
-whose error is drawn, for each pixel, from what the package states."""
+a simulated flight is exact, while its package states an error, and a claim has that of shadows: the figures are given
+for the exact map, and for a map whose error is drawn, for each pixel, from what is stated of it and of shadows."""
 
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -18,6 +18,7 @@ import typer
 
 from terrafix.core.gate import CHI2_95
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.map_error import shared_variance_m2
 from terrafix.messages import NavEstimate
 from terrafix.recorder.reader import read_flight
 from terrafix_lab.bench.result_file import write_result
@@ -46,7 +47,8 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Located:
-    """Error (2,) of a pixel, east and north, with stated covariance (2, 2); stated 1-sigma of the map's error."""
+    """Error (2,) of a pixel, east and north, with stated covariance (2, 2); stated 1-sigma of the map's error and of
+    shadows."""
 
     error_m: np.ndarray
     cov_m2: np.ndarray
@@ -72,7 +74,8 @@ def simulate(out: Path, wanted: FlightOptions) -> Flight:
 def locate_pixels(flight: Flight, replayed: Path, count: int) -> list[Located]:
     """Random pixels of random frames; pixels that show no ground are not counted."""
     locator = FlightLocator.open(replayed)
-    map_sigma_m = {m.frame_id: m.map_sigma_m for _, _, m in read_flight(replayed) if isinstance(m, NavEstimate)}
+    estimates = [m for _, _, m in read_flight(replayed) if isinstance(m, NavEstimate)]
+    map_sigma_m = {m.frame_id: shared_variance_m2(m.map_sigma_m) ** 0.5 for m in estimates}
     times_s = flight.frame_times_s()
     lens, random = lens_of(CAMERA), np.random.default_rng(TRUTH_SEED)
     frame_ids = sorted(locator.flight.views)

@@ -197,7 +197,7 @@ class Images(BaseModel):
 
 class FragmentState(StrEnum):
     UNANCHORED = "unanchored"  # by dead reckoning alone
-    MATCHING = "matching"  # ... and a search for it is active
+    MATCHING = "matching"  # ... and a search is active, or it has enough frames to be matched as a whole
     ANCHORED = "anchored"  # a map match of its own is accepted
     MERGED = "merged"  # tied to the flight before it
 

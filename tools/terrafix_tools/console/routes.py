@@ -131,57 +131,20 @@ async def delete(request: Request, flight_id: FlightId) -> Response:
     return Response(status_code=204)
 
 
-UPLOAD_BODY = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["images"],
-                    "properties": {
-                        "images": {
-                            "type": "array",
-                            "minItems": 10,
-                            "maxItems": 50,
-                            "items": {"type": "string", "format": "binary"},
-                            "description": "JPEG or PNG, in the order of their names",
-                        },
-                        "telemetry": {
-                            "type": "string",
-                            "format": "binary",
-                            "description": "CSV as frames.csv of a flight folder, one row for each image",
-                        },
-                    },
-                }
-            }
-        },
-    }
-}
+def _form(images: dict[str, Any], **files: str) -> dict[str, Any]:
+    """Body of a multipart request: ``images``, with what is said of them, and further ``files`` by name."""
+    binary = {"type": "string", "format": "binary"}
+    listed = {"type": "array", "maxItems": 50, "items": binary, **images}
+    others = {name: {**binary, "description": text} for name, text in files.items()}
+    schema = {"type": "object", "required": ["images"], "properties": {"images": listed, **others}}
+    return {"requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}}
 
 
-PHOTOS_BODY = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["images"],
-                    "properties": {
-                        "images": {
-                            "type": "array",
-                            "maxItems": 50,
-                            "items": {"type": "string", "format": "binary"},
-                            "description": "the first 256 kB of each photo",
-                        },
-                        "description": {"type": "string", "format": "binary", "description": "flight.toml"},
-                    },
-                }
-            }
-        },
-    }
-}
+UPLOAD_BODY = _form(
+    {"minItems": 10, "description": "JPEG or PNG, in the order of their names"},
+    telemetry="CSV as frames.csv of a flight folder, one row for each image",
+)
+PHOTOS_BODY = _form({"description": "the first 256 kB of each photo"}, description="flight.toml")
 
 
 @router.post("/flights/{flight_id}/images/batch", status_code=202, openapi_extra=UPLOAD_BODY)

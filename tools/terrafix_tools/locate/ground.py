@@ -32,8 +32,9 @@ class Surface(StrEnum):
 @dataclass(frozen=True)
 class GroundPatch:
     """Tangent plane of the ground: height AMSL ``up_m`` at ``at_m`` (2,) with ``slope`` (2,), rise towards east and
-    north, and 1-sigma of the height of what the pixel shows. ``level_sigma_m``: the part of it that all ground has in
-    common; ``slope_sigma``: 1-sigma of the slope of visible ground."""
+    north, and 1-sigma of the height of what the pixel shows, relative to the camera. ``level_sigma_m``: 1-sigma of the
+    level that camera and ground have in common, which moves what the ray meets up or down, not sideways;
+    ``slope_sigma``: 1-sigma of the slope of visible ground."""
 
     surface: Surface
     at_m: np.ndarray
@@ -110,9 +111,10 @@ def _cloud_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, reference
     """Plane at the level of the points about the ray, with the slope of ``reference``, whose level the cloud has; None:
     there are too few.
 
-    The height of what a pixel shows departs from that level as those of the points do (houses, trees, relief between
-    them), and by the error of the slope on the way to it from their middle. Where all lie on one side, the ground there
-    may as well be that of ``reference``."""
+    The height of what a pixel shows departs from that level as those of the points do beyond their own errors (houses,
+    trees, relief between them), and by the error of the slope on the way to it from their middle. Where all lie on one
+    side, the ground there may as well be that of ``reference``. An error of its level is one of the height of the
+    camera, too, which was measured above the same ground, and moves the points with it."""
     x, y, z = view.r_w_c.T @ ray
     near, away = cloud.seen_near(view, np.array([x, y]) / z, NEAR, MAX_POINTS)
     count = len(away)
@@ -122,12 +124,12 @@ def _cloud_patch(view: CameraView, ray: np.ndarray, cloud: PointCloud, reference
     weight /= weight.sum()
     above_m = near.points_m[:, UP] - reference.heights_m(near.points_m)
     mean_m = float(weight @ above_m)
-    departure_m2 = float(weight @ np.square(above_m - mean_m)) * count / (count - 1)
+    own_m2 = count / float(np.sum(near.sigma_m**-2.0))
+    surface_m2 = max(float(weight @ np.square(above_m - mean_m)) * count / (count - 1) - own_m2, 0.0)
     from_middle_m = float(np.linalg.norm(weight @ near.points_m[:, HORIZONTAL] - reference.at_m))
-    departure_m = np.sqrt(departure_m2 * (1.0 + weight @ weight))
+    departure_m = np.sqrt(surface_m2 * (1.0 + weight @ weight) + own_m2 / count)
     one_sided_m = mean_m if _largest_gap_rad(away) > MAX_GAP_RAD else 0.0
-    parts_m = [departure_m, reference.level_sigma_m, reference.slope_sigma * from_middle_m, one_sided_m]
-    sigma_m = float(np.linalg.norm(parts_m))
+    sigma_m = float(np.linalg.norm([departure_m, reference.slope_sigma * from_middle_m, one_sided_m]))
     return replace(reference, surface=Surface.POINTS, up_m=reference.up_m + mean_m, sigma_m=sigma_m)
 
 

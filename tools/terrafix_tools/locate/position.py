@@ -6,12 +6,12 @@ one compass), so n pixels together count as much as one: covariance intersection
 1997). Several directions add what a single one lacks, the height of an object that stands above the ground."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from terrafix.core.errors import UsageError
-from terrafix.core.gate import CHI2_95
+from terrafix.core.gate import CHI2_95, GATE
 from terrafix.core.pose import project_with_jacobian, world_to_tangent
 from terrafix.estimator.state import HORIZONTAL, TRANSLATION, UP
 from terrafix_tools.locate.ground import GroundPatch, Surface
@@ -72,14 +72,26 @@ def check_pixel(pixel: Pixel) -> None:
 
 def locate_object(pixels: Sequence[Pixel], patches: Sequence[GroundPatch]) -> ObjectPosition:
     """Position of the one object that all ``pixels`` show. ``patches``: ground at the ray of each pixel; the most exact
-    one of the first kind in the order of ``Surface`` is used."""
+    one of the first kind in the order of ``Surface`` is used, unless all pixels together contradict its height: a mast
+    stands above the points about it."""
     order = list(Surface)
     rank = [(order.index(patch.surface), patch.sigma_m) for patch in patches]
     best = rank.index(min(rank))
     ground = patches[best]
-    point_m = ground.intersect(pixels[best].view.p_c_in_w_m, pixels[best].ray())
-    normal = np.array([*-ground.slope, 1.0]) / ground.sigma_m
-    information = np.outer(normal, normal)
+    start_m = ground.intersect(pixels[best].view.p_c_in_w_m, pixels[best].ray())
+    anywhere = replace(ground, sigma_m=pixels[best].view.height_m)
+    free_m, free_cov = _solved(pixels, start_m, anywhere)
+    normal = np.array([*-ground.slope, 1.0])
+    above_m = free_m[UP] - ground.height_m(free_m)
+    stands = above_m**2 > GATE[1] * (normal @ free_cov @ normal + ground.sigma_m**2)
+    point_m, cov = (free_m, free_cov) if stands else _solved(pixels, start_m, ground)
+    cov[UP, UP] += ground.level_sigma_m**2
+    return ObjectPosition(point_m, cov, ground.surface, tuple(_test_ratio(pixel, point_m) for pixel in pixels))
+
+
+def _solved(pixels: Sequence[Pixel], start_m: np.ndarray, ground: GroundPatch) -> tuple[np.ndarray, np.ndarray]:
+    """-> point (3,) by all ``pixels`` and the ``ground``, and its covariance (3, 3)."""
+    point_m, information, normal = start_m, np.eye(3), np.array([*-ground.slope, 1.0]) / ground.sigma_m
     for _ in range(ITERATIONS):
         information = np.outer(normal, normal)
         gradient = normal * (ground.height_m(point_m) - point_m[UP]) / ground.sigma_m
@@ -92,8 +104,7 @@ def locate_object(pixels: Sequence[Pixel], patches: Sequence[GroundPatch]) -> Ob
         point_m = point_m + step
         if float(np.abs(step).max()) < STEP_TOLERANCE_M:
             break
-    cov = np.linalg.inv(information)
-    return ObjectPosition(point_m, cov, ground.surface, tuple(_test_ratio(pixel, point_m) for pixel in pixels))
+    return point_m, np.linalg.inv(information)
 
 
 def _residual(pixel: Pixel, point_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -136,8 +136,14 @@ def read_views(record: Path) -> FlightViews:
     lens = SolvedLens.of(read_flights(folder / SUMMARY), origin.camera)
     for row in read_poses(folder):
         if (finalised := by_time.get(round(row.t_s, 3))) is not None:
-            view = cameras.at(views[finalised], row.pose(finalised))
-            views[finalised] = view if lens is None else replace(view, calibration=lens.on(view.calibration))
+            before, view = views[finalised], cameras.at(views[finalised], row.pose(finalised))
+            if lens is not None:
+                view = replace(view, calibration=lens.on(view.calibration))
+            elif (
+                finalised in refined
+            ):  # the same pose: height and rays by the described lens, which have its error alike
+                view = replace(view, cov=before.cov)
+            views[finalised] = view
     return FlightViews(origin, frame, views, triples, frames, result.header)
 
 

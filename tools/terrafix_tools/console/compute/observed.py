@@ -58,6 +58,8 @@ from terrafix_tools.console.payloads import (
 from terrafix_tools.estimates import yaw_deg_of
 from terrafix_tools.finalised import FinalRow
 
+# Frames of a fragment from which on it is matched as a whole: the joint correlation has several looks [spec: SV-4]
+READY_FRAMES = 5
 NEAR_M = 20.0  # of the position, within which `confidence` is the probability [spec: AC-1 of the requirements]
 LOST_REASON = "the position is lost and the whole map was searched; a user fix or a hint would help"
 THROUGH_REASON = "all images are computed and the position is not found; a user fix or a hint would help"
@@ -322,8 +324,10 @@ def _state_of(fragment: Fragment, found: MapMatch | None) -> FragmentState:
         return FragmentState.MERGED
     if fragment.state is FragmentState.ANCHORED or (found is not None and found.verdict is Verdict.ACCEPTED):
         return FragmentState.ANCHORED
-    searched = found is not None and found.search.step in SEARCHING_STEPS
-    return FragmentState.MATCHING if searched else FragmentState.UNANCHORED
+    if found is None or found.search.step is SearchStep.SKIP:
+        return FragmentState.UNANCHORED
+    matched = found.search.step in SEARCHING_STEPS or fragment.frames >= READY_FRAMES
+    return FragmentState.MATCHING if matched else FragmentState.UNANCHORED
 
 
 def ellipse_of(cov_m2: np.ndarray) -> Ellipse:
