@@ -18,7 +18,6 @@ INPUT_KINDS = {
     Verdict.UNCONFIRMED: OTHER,
     Verdict.FEW_INLIERS: EMPTY,
     Verdict.NO_FEATURES: EMPTY,
-    Verdict.DEGENERATE: EMPTY,
     Verdict.NO_GROUND: AWAY,
 }
 DETAILS = {
