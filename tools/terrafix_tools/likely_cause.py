@@ -34,7 +34,8 @@ def likely_cause(
     ):
         if of_map.get(verdict, 0) > 0.5 * frames:
             return text
-    matched = of_odometry.get(Verdict.ACCEPTED, 0)
+    # The pictures of the latter agree, too; where the ground lies is not known.
+    matched = of_odometry.get(Verdict.ACCEPTED, 0) + of_odometry.get(Verdict.DEGENERATE, 0)
     if matched < MATCHED_SHARE * frames:
         return (
             f"the frames do not match each other either ({matched} of {frames}): they are blurred, empty, too far "

@@ -11,7 +11,7 @@ from terrafix_tools.flight_verdict import flight_verdict
 from terrafix_tools.likely_cause import likely_cause
 from terrafix_tools.map_probe import best_index, likely_factor
 
-LOST = {"map": {"few_inliers": 40}, "odometry": {"accepted": 38, "few_inliers": 2}}
+LOST = {"map": {"few_inliers": 40}, "odometry": {"accepted": 8, "degenerate": 30, "few_inliers": 2}}
 
 
 def fault(quantity: str, factor: float | None = None, *, active: bool = True) -> CalibrationFault:

@@ -48,7 +48,7 @@ class GimbalReports:
         self.gimbal: Gimbal | None = None
         self._r_c_p = LOOKING_ALONG_X @ Mount().r_b_c().T
         self._reports: deque[GimbalAttitude] = deque(maxlen=BUFFER_REPORTS)
-        self._changed_ns = 0  # time of the newest report that differs from the one before
+        self.changed_ns = 0  # time of the newest report that differs from the one before
         self._compared: tuple[int, float, float] | None = None  # time [ns], pitch of platform, vehicle [rad]
         self._opposite = self._held = 0.0  # nats for reports opposite to the vehicle's pitch, and for a level platform
 
@@ -75,7 +75,7 @@ class GimbalReports:
         if newest is not None and report.t_ns <= newest.t_ns:
             return
         if newest is None or newest.q != report.q:
-            self._changed_ns = report.t_ns
+            self.changed_ns = report.t_ns
         if newest is not None and newest.from_north is not report.from_north:
             self._reports.clear()
         self._reports.append(report)
@@ -109,9 +109,9 @@ class GimbalReports:
     def unchanged_since_ns(self) -> int | None:
         """Since when all reports are the same to the last bit; None: for less than FROZEN_NS. A gimbal holds its angle
         so only while nothing moves it: such reports repeat an old one, or the commanded angle."""
-        if not self._reports or self._reports[-1].t_ns - self._changed_ns < FROZEN_NS:
+        if not self._reports or self._reports[-1].t_ns - self.changed_ns < FROZEN_NS:
             return None
-        return self._changed_ns
+        return self.changed_ns
 
     def at(self, t_ns: int) -> Held | None:
         """None: no report yet."""

@@ -1,6 +1,7 @@
 """Telemetry of the autopilot by time: attitude, height and inertial readings around a frame; what is missing is
 None."""
 
+import math
 from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
@@ -118,8 +119,11 @@ class Telemetry:
         if not refused and (held is None or held.age_ns > MAX_STATE_GAP_NS):
             refused = NOT_REPORTED
         if held is None or refused or self._repeats():
-            platform = replace(platform, yaw_rad=yaw_rad, gimbal_refused=refused or REPEATED)
-            lost = replace(platform, turned_rad=TURN_UNSEEN_RAD, righted_rad=UNKNOWN_ATTITUDE_RAD)
+            platform = replace(platform, gimbal_refused=refused or REPEATED)
+            turned_rad = self._turned_since(self.gimbal.changed_ns, vehicle) if held and held.from_north else 0.0
+            yaw_rad = yaw_rad if yaw_rad is None else yaw_rad + turned_rad
+            unseen_rad = float(np.hypot(TURN_UNSEEN_RAD, turned_rad))
+            lost = replace(platform, yaw_rad=yaw_rad, turned_rad=unseen_rad, righted_rad=UNKNOWN_ATTITUDE_RAD)
             pitches, rolls = (axis not in self.gimbal.stabilised for axis in ("pitch", "roll"))
             if not (pitches or rolls):
                 return replace(lost, pitch_rad=None, roll_rad=None)
@@ -134,6 +138,13 @@ class Telemetry:
             righted_rad=float(np.hypot(held.turns_rad, leans_rad)),
             turned_rad=float(np.hypot(held.turns_rad, leans_rad)),
         )
+
+    def _turned_since(self, t_ns: int, vehicle: Attitude) -> float:
+        """How the vehicle has turned since ``t_ns``, and a gimbal with it, if it does not hold its heading."""
+        turns = self._turns.around(t_ns - 1, t_ns)
+        if turns is None or vehicle.yaw_rad is None:
+            return 0.0
+        return math.remainder(vehicle.yaw_rad - float(turns[1][0, -1]), math.tau)
 
     def _repeats(self) -> bool:
         """The gimbal reports no change while the vehicle leans."""

@@ -6,7 +6,7 @@ that begins with its first frame."""
 from collections import Counter
 
 from terrafix.estimator.measurements.telemetry_buffer import NOT_REPORTED, OF_SERVOS, REPEATED
-from terrafix.messages import CalibrationFault, Verdict
+from terrafix.messages import GIMBAL_FAULTS, CalibrationFault, Verdict
 
 FROZEN, OTHER, EMPTY = "picture frozen", "picture contradicts motion", "picture without texture"
 AWAY = "picture without ground"
@@ -18,7 +18,6 @@ INPUT_KINDS = {
     Verdict.UNCONFIRMED: OTHER,
     Verdict.FEW_INLIERS: EMPTY,
     Verdict.NO_FEATURES: EMPTY,
-    Verdict.DEGENERATE: EMPTY,
     Verdict.NO_GROUND: AWAY,
 }
 DETAILS = {
@@ -51,7 +50,8 @@ class RefusedInput:
             if not self._active or self._used < REFUSED_FRAMES:
                 return []
             ended, self._active = self._active, ""
-            return [CalibrationFault(t_ns=t_ns, quantity=ended, factor=None, detail="it is used", active=False)]
+            detail = "reports are used" if ended in GIMBAL_FAULTS else "pictures are used"
+            return [CalibrationFault(t_ns=t_ns, quantity=ended, factor=None, detail=detail, active=False)]
         if kind is None:
             return []
         self._used = 0
@@ -59,6 +59,5 @@ class RefusedInput:
         first_ns = self._refused[0][0]
         if self._active or len(self._refused) < REFUSED_FRAMES or t_ns - first_ns < AFTER_NS:
             return []
-        self._active = Counter(kind for _, kind in self._refused).most_common(1)[0][0]
-        detail = DETAILS[self._active]
-        return [CalibrationFault(t_ns=first_ns, quantity=self._active, factor=None, detail=detail, active=True)]
+        self._active = most = Counter(kind for _, kind in self._refused).most_common(1)[0][0]
+        return [CalibrationFault(t_ns=first_ns, quantity=most, factor=None, detail=DETAILS[most], active=True)]

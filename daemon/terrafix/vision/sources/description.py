@@ -233,24 +233,17 @@ def origin_of(
 ) -> Origin:
     """The flight's Origin at t 0. ``start`` (lat_deg, lon_deg) overrides [start]; without both, the initial position is
     unknown (infinite sigma, ``core.initial_position``). ``attitude_sigma_deg``: where [telemetry] does not state it."""
-    known = description.start is not None or start is not None
-    lat_deg, lon_deg = (
-        start if start else (description.start.lat_deg, description.start.lon_deg) if description.start else (0.0, 0.0)
-    )
-    ground_m = None
-    if description.start:
-        ground_m = (
-            description.start.ground_amsl_m
-            if description.start.ground_amsl_m is not None
-            else description.start.alt_amsl_m
-        )
+    stated, ground_m = description.start, None
+    lat_deg, lon_deg = start or ((stated.lat_deg, stated.lon_deg) if stated else (0.0, 0.0))
+    if stated:
+        ground_m = stated.alt_amsl_m if stated.ground_amsl_m is None else stated.ground_amsl_m
     return Origin(
         t_ns=0,
         camera=camera,
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         ground_amsl_m=ground_m,
-        start_sigma_m=description.start.sigma_m if description.start else START_SIGMA_M if known else math.inf,
+        start_sigma_m=stated.sigma_m if stated else START_SIGMA_M if start else math.inf,
         yaw_sigma_deg=description.telemetry.yaw_sigma_deg,
         agl_sigma_m=description.telemetry.agl_sigma_m,
         attitude_sigma_deg=description.telemetry.attitude_sigma_deg or attitude_sigma_deg,

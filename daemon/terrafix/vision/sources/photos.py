@@ -162,7 +162,8 @@ class Photos:
     def _make_origin(self, first: PhotoInfo, camera: Camera, start: tuple[float, float] | None) -> Origin:
         description = self._description
         if start is None and description.start is None and first.lat_deg is not None and first.lon_deg is not None:
-            description = _with_start(description, first.lat_deg, first.lon_deg)
+            start_table = StartTable(lat_deg=first.lat_deg, lon_deg=first.lon_deg)
+            description = msgspec.structs.replace(description, start=start_table)
         origin = origin_of(description, camera, start, STATED_TILT_SIGMA_DEG)
         if self._apart_deg <= MAX_YAWS_APART_DEG:
             return origin
@@ -204,15 +205,6 @@ class Photos:
         )
         check_camera(self.folder, camera, f"the photos' EXIF ({first.lens.focal_from}):")
         return camera
-
-
-def _with_start(description: Description, lat_deg: float, lon_deg: float) -> Description:
-    return Description(
-        name=description.name,
-        map=description.map,
-        telemetry=description.telemetry,
-        start=StartTable(lat_deg=lat_deg, lon_deg=lon_deg),
-    )
 
 
 def _counted(sources: Counter[str], count: int) -> str:

@@ -36,6 +36,6 @@ def test_a_run_of_refused_pictures_is_named_from_its_first_one_to_three_used_one
 
 def test_less_than_three_seconds_and_frames_without_an_image_are_not_named() -> None:
     assert faults_of(*[Verdict.STALLED] * 6, Verdict.ACCEPTED) == []
-    assert faults_of(*[Verdict.OVERTAKEN] * 20, Verdict.STALLED, *[Verdict.OVERTAKEN] * 20) == []
+    assert faults_of(*[Verdict.OVERTAKEN] * 20, Verdict.STALLED, *[Verdict.DEGENERATE] * 20) == []
     began, *others = faults_of(*[Verdict.STALLED] * 8, Verdict.ACCEPTED, Verdict.ACCEPTED, *[Verdict.STALLED] * 9)
     assert began.active and others == [], "two used ones are no end"
