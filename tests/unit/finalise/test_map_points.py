@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from terrafix.core.geodesy import quat_from_rot
-from terrafix.core.pnp import solved
+from terrafix.core.pnp import outlier_inflation, random_inlier_probability, solved
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.messages import MapMatch, PnpInput, Verdict
@@ -69,13 +69,14 @@ def test_a_match_keeps_the_heights_of_its_points_and_the_rays_of_the_description
     assert MatchedPoints.of(msgspec.structs.replace(received, pnp=None), solved(received), Terrain(0.0)) is None
 
 
-def test_wrong_points_are_left_out() -> None:
-    fit = matched(wrong=9).fit(LENS)
+def test_wrong_points_are_left_out_and_widen_the_pose_and_too_few_give_none() -> None:
+    points = replace(matched(wrong=9), local_m=0.0, roofs_m=0.0, slope=0.0)
+    right = replace(points, xy=points.xy[9:], points_m=points.points_m[9:], weights=points.weights[9:])
+    fit, alone = points.fit(LENS), right.fit(LENS)
     assert fit is not None and not fit.inliers[:9].any() and fit.inliers[9:].all()
-    assert np.linalg.norm(fit.p_m - P_M) < 0.5
-
-
-def test_too_few_points_give_no_fit() -> None:
+    assert alone is not None and np.linalg.norm(fit.p_m - P_M) < 0.5
+    more, less = (np.trace(rows.T @ rows) for rows in (right.rows(alone).rows, points.rows(fit).rows))
+    assert more / less == pytest.approx(outlier_inflation(40, 31, random_inlier_probability(points.given)), rel=0.01)
     assert matched(points=7).fit(LENS) is None
 
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from terrafix.core.gate import CHI2_95
 from terrafix.core.pose import exp_so3
+from terrafix.smoother.sim3_consensus import place
 from terrafix.smoother.sim3_pose_graph import merge
 from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, RelativeConstraint, Submap
 from terrafix_lab.bench.growth.merging import STEP_SIGMAS, SubmapFlight, make_submap_flight, measure, pose_errors
 from terrafix_tools.score import nees_of
-
-CHI2_95_2 = 5.991
 
 
 def without(flight: SubmapFlight, *gone: int) -> list[AbsoluteConstraint]:
@@ -41,6 +41,13 @@ def test_outlier_anchors_are_rejected_without_loss_of_accuracy() -> None:
     assert median_m(flight, merged) <= 1.1 * median_m(flight, without_outliers)
 
 
+def test_an_anchor_places_a_submap_at_first_only_where_others_agree() -> None:
+    flight = make_submap_flight(12, submaps=1, keyframes=40, scale_known=True, wrong_share=0.0)
+    wrong = replace(flight.anchors[0], p_c_in_w_m=flight.anchors[0].p_c_in_w_m + 500.0)
+    found = place(flight.submaps[0], [wrong, *flight.anchors[1:]])
+    assert found is not None and np.abs(found.position(flight.submaps[0].p_c_in_f) - flight.p_w_m[0]).max() < 30.0
+
+
 def test_almost_half_of_the_anchors_may_be_inconsistent_outliers() -> None:
     flight = make_submap_flight(4, submaps=1, keyframes=100, wrong_share=0.4)
     merged = merge(flight.submaps, flight.anchors)
@@ -60,7 +67,7 @@ def test_the_covariance_is_consistent_with_the_errors(scale_known: bool) -> None
         east_north = np.einsum("nij,nj->ni", to_ground, errors[:, 3:])
         nees_horizontal.append(nees_of(east_north, to_ground @ covs[:, 3:, 3:] @ np.transpose(to_ground, (0, 2, 1))))
     assert 0.85 < float(np.mean(nees_6d)) / 6.0 < 1.2
-    assert 0.92 < float(np.mean(np.concatenate(nees_horizontal) <= CHI2_95_2)) < 0.98
+    assert 0.92 < float(np.mean(np.concatenate(nees_horizontal) <= CHI2_95)) < 0.98
 
 
 def test_the_result_does_not_depend_on_the_order_of_the_anchors() -> None:

@@ -73,12 +73,6 @@ def test_frames_of_two_objects_are_named_and_end_with_exit_code_1(record: Path) 
     assert "frame 2 shows something else" in done.output
 
 
-def test_one_object_in_several_frames_is_one_position(record: Path) -> None:
-    sightings = [(str(i), rig.pixel(i, ROOF_M)) for i in (1, 2, 3, 4)]
-    found = FlightLocator.open(record).locate(sightings)
-    assert found.consistent and found.p_m == pytest.approx(ROOF_M, abs=0.3)
-
-
 def test_height_is_not_above_sea_level_where_neither_start_nor_map_has_an_elevation(tmp_path: Path) -> None:
     messages = [rig.origin(ground_amsl_m=None), *rig.messages()[1:]]
     write_record(tmp_path / "flight.mcap", messages)
