@@ -1,13 +1,20 @@
 """Why pictures are not used for seconds: frozen ones, those of another flight, and those that show nothing.
 
 Each frame has its verdict at once, and refused pictures move nothing; this names the cause of a run of them, as a fault
-that begins with its first frame."""
+that begins with its first frame. Pictures of another flight with the speed and course of this one are used: only the
+map contradicts them, as it does not show other ground either."""
 
+import math
 from collections import Counter
 
+import numpy as np
+
+from terrafix.estimator.integrity.fragments import HIT_RATE_MEMORY, MAX_HIT_RATE
+from terrafix.estimator.monitors.registration import REGISTRATION_SPACING_HEIGHTS
 from terrafix.messages import CalibrationFault, Verdict
 
 FROZEN, OTHER, EMPTY = "picture frozen", "picture contradicts motion", "picture without texture"
+UNSEEN = "picture not on the map"
 INPUT_KINDS = {
     Verdict.STALLED: FROZEN,
     Verdict.IMPLAUSIBLE: OTHER,  # it agrees with itself, and not with this flight
@@ -20,10 +27,12 @@ DETAILS = {
     FROZEN: "the camera repeats a picture while the vehicle moves: check camera and stream",
     OTHER: "the pictures agree with each other, and not with the motion of this flight: check which stream it is",
     EMPTY: "too few matches from picture to picture, as over water, in cloud or in the dark",
+    UNSEEN: "since odometry was interrupted the map shows none of the ground, before it did: check which stream it is",
 }
 # ns and frames without a used picture; used pictures in a row that end it. [spec: allowed to a wrong fix, score.py]
 AFTER_NS = 3_000_000_000
 REFUSED_FRAMES = 3  # [spec: positions in a row of the score]
+UNSEEN_NATS = 6.9  # [spec: one interruption in a thousand whose ground the map shows as often as that before it]
 
 
 class RefusedPictures:
@@ -32,9 +41,12 @@ class RefusedPictures:
         self._used = 0  # in a row
         self._active = ""
 
-    def add(self, t_ns: int, verdict: Verdict) -> list[CalibrationFault]:
-        """``verdict``: on the odometry of a frame. -> the fault that begins or ends with it; else nothing."""
-        if verdict is Verdict.ACCEPTED:
+    def add(self, t_ns: int, verdict: Verdict, unseen_ns: int | None = None) -> list[CalibrationFault]:
+        """``verdict``: on the odometry of a frame. ``unseen_ns``: since when the map shows none of the ground
+        (UnseenGround). -> the fault that begins or ends with it; else nothing."""
+        if unseen_ns is not None and not self._active:
+            return self._begin(unseen_ns, UNSEEN)
+        if verdict is Verdict.ACCEPTED and unseen_ns is None:
             self._refused, self._used = [], self._used + 1
             if not self._active or self._used < REFUSED_FRAMES:
                 return []
@@ -47,6 +59,29 @@ class RefusedPictures:
         first_ns = self._refused[0][0]
         if self._active or len(self._refused) < REFUSED_FRAMES or t_ns - first_ns < AFTER_NS:
             return []
-        self._active = Counter(kind for _, kind in self._refused).most_common(1)[0][0]
-        detail = DETAILS[self._active]
-        return [CalibrationFault(t_ns=first_ns, quantity=self._active, factor=None, detail=detail, active=True)]
+        return self._begin(first_ns, Counter(kind for _, kind in self._refused).most_common(1)[0][0])
+
+    def _begin(self, t_ns: int, kind: str) -> list[CalibrationFault]:
+        self._active, self._used = kind, 0
+        return [CalibrationFault(t_ns=t_ns, quantity=kind, factor=None, detail=DETAILS[kind], active=True)]
+
+
+class UnseenGround:
+    """``since_ns``: time since which the map shows none of the frames, of an odometry that was interrupted before, and
+    has shown most of those before that; None: it does, or nothing was interrupted."""
+
+    def __init__(self) -> None:
+        self.since_ns: int | None = None
+        self._shown_share, self._shown_in = 0.0, -1  # of the correlations; newest fragment of vision with one
+        self._nats, self._first_ns, self._at = 0.0, 0, np.full(2, np.inf)
+
+    def add(self, t_ns: int, fragment_id: int, at: np.ndarray, *, shown: bool) -> None:
+        """A correlation of a frame at ``at`` (2,) [heights]."""
+        if shown or fragment_id == self._shown_in or self._shown_in < 0:
+            self._shown_share += (float(shown) - self._shown_share) / HIT_RATE_MEMORY
+            self._shown_in = fragment_id if shown else self._shown_in
+            self.since_ns, self._nats, self._at = None, 0.0, np.full(2, np.inf)
+        elif float(np.hypot(*(at - self._at))) >= REGISTRATION_SPACING_HEIGHTS:
+            self._first_ns = t_ns if self._nats == 0.0 else self._first_ns
+            self._nats, self._at = self._nats - math.log(1.0 - min(self._shown_share, MAX_HIT_RATE)), at
+            self.since_ns = self._first_ns if self._nats >= UNSEEN_NATS else None

@@ -46,8 +46,9 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"mirrored picture: no fix",
     r"picture squeezed by 1\.(19|33) in [xy]: no fix",
     r"picture (upside down|mirrored|turned by -?90 deg): not used",
-    r"the picture is right again",
-    r"(scale|heading|mount yaw|mirrored picture|aspect ratio) is plausible again",
+    r"(the picture is right again|picture not on the map|the picture is on the map again)",
+    r"focal or ground height seems x[\d.]+ off",
+    r"(focal length|scale|heading|mount yaw|mirrored picture|aspect ratio) is plausible again",
     r"autopilot (does not use the position|uses a position again)",
 ]
 
@@ -205,6 +206,18 @@ def test_a_picture_that_turns_in_flight_is_reported_to_the_pilot_as_not_used(
     began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
     assert is_known(began.text) and quantity in began.text and began.text.endswith("not used") and began.severity == 2
     assert ended.text == "Terrafix: the picture is right again" and ended.severity == 6
+
+
+@pytest.mark.parametrize(
+    ("quantity", "factor", "text"),
+    [("focal length", 1.28, "focal or ground height seems x1.28 off"), ("picture not on the map", None, None)],
+)
+def test_a_fault_that_the_claim_contains_is_told_without_a_word_of_the_fix(
+    quantity: str, factor: float | None, text: str | None
+) -> None:
+    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
+    assert began.text == f"Terrafix: {text or quantity}" and ended.severity == 6
+    assert is_known(began.text) and is_known(ended.text)
 
 
 @pytest.mark.parametrize("quantity", LINK_FAULTS)
