@@ -29,7 +29,7 @@ from terrafix.estimator.measurements.odometry import NO_NEW_VIEW, without_ground
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
-from terrafix.estimator.monitors.refused_pictures import RefusedPictures, UnseenGround
+from terrafix.estimator.monitors.refused_pictures import OTHER, UNSEEN, RefusedPictures, UnseenGround
 from terrafix.estimator.output import (
     calibration_of,
     estimate_of,
@@ -394,7 +394,9 @@ class EstimatorNode:
         flight = self._flight
         if state.orientation.fault is not None or flight.time_offset.is_wrong or flight.monitors.focal_changed:
             return self._refused.add(t_ns, Verdict.ACCEPTED)
-        return self._refused.add(t_ns, verdict, self._unseen.since_ns)
+        since_ns = self._unseen.since_ns
+        known = None if since_ns is None else (UNSEEN, since_ns)
+        return self._refused.add(t_ns, verdict, (OTHER, t_ns) if state.images_contradicted else known)
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved

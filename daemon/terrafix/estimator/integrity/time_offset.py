@@ -207,7 +207,7 @@ class TimeOffset:
         if kind in self._contradicted or under_way:  # a correction that is under way moves the frames as well
             return
         self._contradicted.add(kind)
-        agreed_s, sigma_s = self._agreed = self._agreed or self.estimate
+        agreed_s, sigma_s = self._agreed = self._agreed or self._agreement
         seen = replace(seen, agreed_sigma_s=sigma_s)
         self.forget_images()
         since_s = 0.0 if self._at_ns is None else (seen.t_ns - self._at_ns) * 1e-9
@@ -228,8 +228,14 @@ class TimeOffset:
             return
         held_s, self._new_ns = (self._repeated_ns - self._new_ns) * 1e-9, t_ns
         if 0.0 < held_s <= DRIFT_GRID_S[-1] and self.buffered:
-            self._agreed, self._contradicted = self._agreed or self.estimate, set()
+            self._agreed, self._contradicted = self._agreed or self._agreement, set()
             self._mass, self._density = held(self._mass, held_s), None
+
+    @property
+    def _agreement(self) -> tuple[float, float]:
+        """Offset with which the estimate agrees, and its 1-sigma."""
+        mean_s = self.estimate[0]
+        return mean_s, self._claim_about(mean_s)
 
     @property
     def is_held(self) -> bool:
@@ -256,12 +262,14 @@ class TimeOffset:
 
         The prior's sigma limits it until the probability of an offset that transfer does not explain reaches
         MIN_COMPONENT_WEIGHT, where it affects a 95 % ellipse."""
-        remaining_s = self._sigma_about(self.applied_s)
+        remaining_s = self._claim_about(self.applied_s)
         if float(self.density[-2:].sum() + self.density[:2].sum()) >= MIN_COMPONENT_WEIGHT:
             return max(remaining_s, OUTSIDE_S)
-        return (
-            remaining_s if self._far(self.applied_s) >= MIN_COMPONENT_WEIGHT else min(remaining_s, self._prior_sigma_s)
-        )
+        return remaining_s
+
+    def _claim_about(self, from_s: float) -> float:
+        sigma_s = self._sigma_about(from_s)
+        return sigma_s if self._far(from_s) >= MIN_COMPONENT_WEIGHT else min(sigma_s, self._prior_sigma_s)
 
     def step(self, dt_s: float) -> bool:
         """Moves ``applied_s`` towards the estimate where that is known and not 0, towards 0 where it is 0; elsewhere it

@@ -41,12 +41,12 @@ class RefusedPictures:
         self._used = 0  # in a row
         self._active = ""
 
-    def add(self, t_ns: int, verdict: Verdict, unseen_ns: int | None = None) -> list[CalibrationFault]:
-        """``verdict``: on the odometry of a frame. ``unseen_ns``: since when the map shows none of the ground
-        (UnseenGround). -> the fault that begins or ends with it; else nothing."""
-        if unseen_ns is not None and not self._active:
-            return self._begin(unseen_ns, UNSEEN)
-        if verdict is Verdict.ACCEPTED and unseen_ns is None:
+    def add(self, t_ns: int, verdict: Verdict, known: tuple[str, int] | None = None) -> list[CalibrationFault]:
+        """``verdict``: on the odometry of a frame. ``known``: kind and begin of what a test over frames has found. ->
+        the fault that begins or ends with it; else nothing."""
+        if known is not None and not self._active:
+            return self._begin(*known)
+        if verdict is Verdict.ACCEPTED and known is None:
             self._refused, self._used = [], self._used + 1
             if not self._active or self._used < REFUSED_FRAMES:
                 return []
@@ -59,9 +59,9 @@ class RefusedPictures:
         first_ns = self._refused[0][0]
         if self._active or len(self._refused) < REFUSED_FRAMES or t_ns - first_ns < AFTER_NS:
             return []
-        return self._begin(first_ns, Counter(kind for _, kind in self._refused).most_common(1)[0][0])
+        return self._begin(Counter(kind for _, kind in self._refused).most_common(1)[0][0], first_ns)
 
-    def _begin(self, t_ns: int, kind: str) -> list[CalibrationFault]:
+    def _begin(self, kind: str, t_ns: int) -> list[CalibrationFault]:
         self._active, self._used = kind, 0
         return [CalibrationFault(t_ns=t_ns, quantity=kind, factor=None, detail=DETAILS[kind], active=True)]
 

@@ -58,10 +58,11 @@ def test_pictures_after_an_interruption_that_the_map_does_not_show_are_named_fro
     unseen = unseen_of(*[True] * 40, *[False] * 4, fragments=[0] * 40 + [1] * 4)
     assert unseen.since_ns == 20_000_000_000
     refused = RefusedPictures()
-    (began,) = refused.add(22_000_000_000, Verdict.ACCEPTED, unseen.since_ns)
+    (began,) = refused.add(22_000_000_000, Verdict.ACCEPTED, (UNSEEN, unseen.since_ns))
     assert (began.quantity, began.t_ns) == (UNSEEN, 20_000_000_000) and fault_text(began) == UNSEEN
     unseen.add(23_000_000_000, 1, np.zeros(2), shown=True)
-    later = [refused.add(k * 1_000_000_000, Verdict.ACCEPTED, unseen.since_ns) for k in (23, 24, 25)]
+    assert unseen.since_ns is None
+    later = [refused.add(k * 1_000_000_000, Verdict.ACCEPTED) for k in (23, 24, 25)]
     assert [fault.active for faults in later for fault in faults] == [False]
 
 
