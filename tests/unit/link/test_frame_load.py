@@ -30,7 +30,7 @@ def texts_of(left_out: list[bool], error: str = OVERTAKEN) -> list[str]:
 def test_a_computer_that_leaves_out_most_frames_is_reported_once_and_so_is_its_recovery() -> None:
     slow, fast = [i % 4 != 0 for i in range(60)], [False] * 60
     assert texts_of(fast + slow + fast) == [
-        "Terrafix: computer too slow: 6 of 10 frames late",
+        "Terrafix: computer too slow: 4 of 10 frames late",
         "Terrafix: computer keeps up again",
     ]
 
@@ -39,11 +39,11 @@ def test_the_verdict_names_the_span_in_which_the_computer_was_too_slow() -> None
     left_out = [False] * 60 + [True] * 40 + [False] * 60
     faults = [(x.t_ns / S, x) for x in published_of(left_out) if isinstance(x, CalibrationFault)]
     ((from_s, to_s, which),) = flight_verdict([Row(file="", t_s=80.0)], faults).refused
-    assert from_s == 30.0 and 50.0 < to_s <= 52.5 and which == "computer too slow"
+    assert from_s == 30.0 and 50.0 < to_s <= 53.0 and which == "computer too slow"
 
 
 def test_a_few_overtaken_frames_are_no_slow_computer() -> None:
-    assert texts_of([i % 2 == 0 for i in range(9)]) == [] and texts_of([i % 3 == 0 for i in range(100)]) == []
+    assert texts_of([i % 4 == 0 for i in range(100)]) == []
 
 
 def test_unreadable_images_are_no_slow_computer() -> None:
@@ -66,4 +66,4 @@ def test_positions_that_come_after_the_next_frame_are_a_slow_computer_and_a_slow
         published += node.on(frame)
         late_ns = (took_ms if i > 20 else camera_ms + 50) * MS
         published += node.on(estimate(frame.t_ns, late_ns=late_ns, frame_id=i))
-    assert texts(published) == ["Terrafix: computer too slow: 6 of 10 frames late"] * told
+    assert texts(published) == ["Terrafix: computer too slow: 4 of 10 frames late"] * told
