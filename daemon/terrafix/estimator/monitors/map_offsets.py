@@ -12,7 +12,8 @@ FIRST_POSES = 5  # [spec: two seconds at 2 Hz: shorter than a zoom that is seen 
 # 1-sigma by which the ratio of the two changes in flight: the elevation of the map, and a barometer that drifts, by
 # 2 m each over 110 m [spec: of a Copernicus DEM, and of an hour of weather]
 HEIGHT_CHANGE_SIGMA = 0.025
-HEIGHT_CHANGE_NOISE = 0.025  # 1-sigma of one pose's height over one kind of ground, share of it [tuned]
+# 1-sigma of one pose's height over one kind of ground, share of it
+HEIGHT_CHANGE_NOISE = 0.025  # [measured: docs/decisions/059-images-against-inertial-sensors.md]
 
 
 class OffsetMonitor:
