@@ -164,6 +164,7 @@ class TimeOffset:
         self._agreed: tuple[float, float] | None = None  # its mean and 1-sigma
         self._new_ns, self._repeated_ns = 0, 0  # stamp of the newest frame with a new view, and of a repeat since
         self._contradicted: set[str] = set()
+        self._held = False  # repeats came before the newest new view, and the map has not agreed since
         self._jumps = False  # what has contradicted is known, and not subtracted yet
 
     def stamped(self, frame: Frame) -> None:
@@ -195,7 +196,7 @@ class TimeOffset:
 
     def agree(self) -> None:
         """The map has confirmed the position, or moved it to where the images are."""
-        self._jumps = self._jumps and abs(self.estimate[0] - self.applied_s) > FAR_S
+        self._jumps, self._held = self._jumps and self._held, False  # a match of the frame that jumped, at its old time
         self._agreed, self._contradicted = None, set()
 
     def contradict(self, seen: Contradiction, telemetry: Telemetry, *, by_map: bool) -> None:
@@ -228,7 +229,7 @@ class TimeOffset:
             return
         held_s, self._new_ns = (self._repeated_ns - self._new_ns) * 1e-9, t_ns
         if 0.0 < held_s <= DRIFT_GRID_S[-1] and self.buffered:
-            self._agreed, self._contradicted = self._agreed or self._agreement, set()
+            self._agreed, self._contradicted, self._held = self._agreed or self._agreement, set(), True
             self._mass, self._density = held(self._mass, held_s), None
 
     @property
