@@ -589,7 +589,8 @@ class CalibrationFault(Message, frozen=True, kw_only=True):
 
     ``quantity``: "scale" (height or focal length), "mount yaw", "heading", "attitude", "aspect ratio", "mirrored
     picture", "registration" (frames match the map nowhere, for an unknown reason); and of images that are refused since
-    a moment of the flight "picture upside down", "picture turned", "picture mirrored";
+    a moment of the flight "picture upside down", "picture turned", "picture mirrored", "picture frozen", "picture
+    contradicts motion", "picture without texture"; "picture not on the map", "focal length" (it changes in flight),
     "camera time" (stamps against the autopilot), "start" (the vehicle stood on what moves). Of the link, of frames and
     telemetry that are left out, a gimbal included: those of LINK_FAULTS in ``link/pilot_text/statustext.py``."""
 

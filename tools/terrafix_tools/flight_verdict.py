@@ -25,8 +25,8 @@ MAX_UNANCHORED_S = DEGRADATION_LEVELS[-1][0]  # longest time without a map match
 MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejected by the estimator's innovation gate
 # Faults that begin in flight; all others are of the description, which was wrong from the beginning.
 BEGIN_IN_FLIGHT = ("registration", "picture upside down", "picture turned", "picture mirrored")
-# Faults whose frames or telemetry were left out: the position went on without them, at a claim of its own.
-REFUSED = (*DETAILS, *LINK_FAULTS)
+# Faults whose frames or telemetry were left out, or which the claim contains: the position went on.
+REFUSED = (*DETAILS, "focal length", *LINK_FAULTS)
 # One of map and initial position is wrong; no measurement on board decides which.
 START_CONTRADICTS_MAP = "start and map contradict each other: one of them is in the wrong place"
 MAX_SHOWN_SPANS = 3

@@ -52,7 +52,7 @@ NOTHING_FOUND = (Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE)
 class MapResult:
     """What was done with a map match: ``fusion``, the verdict on it, and ``others``: on a start coordinate that the map
     contradicts, and on a reset of the graph. ``fixed``: of an accepted match, for the smoother. ``off``: (2,) of a pose
-    that the gate has rejected, from the estimate of its frame."""
+    from the estimate of its frame, of one that the gate has rejected or that is fused."""
 
     fusion: FusionVerdict
     others: tuple[FusionVerdict, ...] = ()
@@ -181,12 +181,13 @@ class MapUpdate:
             assert fusion.innovation is not None
             return self._reject(match, node, measurement, fusion.innovation)
         self._rejected.clear()
+        off = None if match.position_only else measurement.position_innovation(*predicted)
         if not match.position_only:
             self.hypotheses.other_ground.on_pose(share, position)
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
         state.covariances.record(node)
-        return MapResult(replace(fusion, detail=f"information share {share:.2f}"), fixed=fixed)
+        return MapResult(replace(fusion, detail=f"information share {share:.2f}"), fixed=fixed, off=off)
 
     def _learn_from_pose(self, match: MapMatch, node: int, before: NodeState, measurement: MapPoseMeasurement) -> None:
         """Updates terrain roughness, alternative position and map hit rate with an accepted pose. ``before``: the node

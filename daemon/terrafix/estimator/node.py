@@ -23,13 +23,14 @@ from terrafix.estimator.integrity.camera_vehicle import CameraVehicleTest
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.offset_drift import STEP_S
 from terrafix.estimator.integrity.time_offset import Contradiction, TimeOffset
+from terrafix.estimator.map_update import NOTHING_FOUND
 from terrafix.estimator.measurements.ahrs_correction import AhrsCorrectionMonitor
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning
 from terrafix.estimator.measurements.odometry import NO_NEW_VIEW, without_ground
 from terrafix.estimator.measurements.telemetry_buffer import Attitude, Telemetry
 from terrafix.estimator.measurements.user_fix import UserFixMeasurement, apply_user_fix
 from terrafix.estimator.monitors.calibration_monitors import Monitors
-from terrafix.estimator.monitors.refused_pictures import INPUT_KINDS, RefusedInput
+from terrafix.estimator.monitors.refused_pictures import INPUT_KINDS, OTHER, UNSEEN, RefusedInput, UnseenGround
 from terrafix.estimator.output import (
     calibration_of,
     estimate_of,
@@ -76,6 +77,7 @@ COOL = Health(
     t_ns=0, band=ThermalBand.NORMAL, temperature_c=None, throttled=False, disk_free_mb=None, cause="no reading yet"
 )
 START_QUANTITY = "start"
+NO_VIEW = (Verdict.BAD_IMAGE, Verdict.OVERTAKEN, Verdict.NO_GROUND)  # frames that repeat nothing, and show nothing new
 BEFORE_TELEMETRY = "older than the autopilot's first messages after the restart"
 
 MakeEstimator = Callable[[Origin, NavPrior | None], Estimator]
@@ -122,7 +124,7 @@ class EstimatorNode:
         self._relocated = False  # a relocalisation has moved the estimate since
         self._monitors: Monitors | None = None
         self._rebuilds = 0  # of the graph
-        self._refused, self._gimbal_refused = RefusedInput(), RefusedInput()
+        self._refused, self._gimbal_refused, self._unseen = RefusedInput(), RefusedInput(), UnseenGround()
         self._start_moved = False  # as reported
         self._handlers: dict[type[Message], Callable[..., Iterable[Message]]] = {
             Origin: self._on_origin,
@@ -352,6 +354,8 @@ class EstimatorNode:
             # Turned or mirrored images move otherwise at any time, repeated ones not at all, those of no ground anyhow.
             # Near the ground images move by more than their error, and on it the attitude wanders alone.
             low = frame.attitude.stands or agl_m < MIN_MATCHING_AGL_M
+            if result.verdict not in NO_VIEW:
+                time_offset.view(stamped_ns, repeated=result.verdict is Verdict.STALLED)
             untimed = result.verdict is Verdict.STALLED or not frame.attitude.sees_ground or low
             untimed = untimed or bool(frame.attitude.gimbal_refused)  # what moves the image is not the vehicle alone
             jump = estimator.state.image_jump
@@ -360,6 +364,8 @@ class EstimatorNode:
             else:
                 if jump is not None and jump[0] == frame.t_s:
                     self._time_contradicted(stamped_ns, jump[1], result.placed, by_map=False)
+                elif time_offset.is_held and result.off is not None:
+                    self._time_contradicted(stamped_ns, result.off, result.placed, by_map=False)
                 time_offset.add(msgspec.structs.replace(odometry, t_ns=stamped_ns), self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
         yield from self._refused_pictures(odometry.t_ns, result.verdict, estimator.state, frame.attitude)
@@ -390,8 +396,12 @@ class EstimatorNode:
             return ()
         if verdict is Verdict.UNCONFIRMED and not state.continuity.last_increment_inertial:
             return ()  # nothing says how the vehicle moves
-        named = state.orientation.fault is not None or self._flight.time_offset.is_wrong
-        return self._refused.add(t_ns, "" if named else INPUT_KINDS.get(verdict))
+        flight = self._flight
+        if state.orientation.fault is not None or flight.time_offset.is_wrong or flight.monitors.focal_changed:
+            return self._refused.add(t_ns, "")
+        since_ns = self._unseen.since_ns
+        known = None if since_ns is None else (UNSEEN, since_ns)
+        return self._refused.add(t_ns, INPUT_KINDS.get(verdict), (OTHER, t_ns) if state.images_contradicted else known)
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved
@@ -522,12 +532,16 @@ class EstimatorNode:
         yield from (verdict_of(match.t_ns, match.frame_id, verdict, fragment) for verdict in verdicts)
         yield outcome.solution
         accepted = result.verdict is Verdict.ACCEPTED
-        if accepted:
-            flight.time_offset.agree()
-        elif result.off is not None and estimator.last is not None:
+        if (accepted or result.verdict in NOTHING_FOUND) and fragment is not None and estimator.last is not None:
+            p = estimator.last.pose.translation()
+            at = p[:2] / max(estimator.terrain.height_above_m(p), 1.0)
+            self._unseen.add(match.t_ns, fragment.fragment_id, at, shown=accepted)
+        if result.off is not None and estimator.last is not None and (flight.time_offset.is_held or not accepted):
             stamp_ns = match.t_ns + round(flight.time_offset.applied_s * 1e9)
             self._time_contradicted(stamp_ns, result.off, estimator.last, by_map=True)
             yield from flight.time_offset.take_changes(match.t_ns)
+        if accepted:
+            flight.time_offset.agree()
         if self._monitors is not None:
             yield from self._monitors.take_changes(match.t_ns)
         changed = accepted or was_multimodal or estimator.hypotheses.is_multimodal or result.verdict is Verdict.LOST

@@ -12,7 +12,7 @@ from terrafix.estimator.aiding import AID_SOURCES
 from terrafix.estimator.filter_state import FilterState, FrameInput, FrameState, ImuQuery
 from terrafix.estimator.graph.pose_graph import NewNode
 from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffDetector, continue_from, start_at
-from terrafix.estimator.integrity.innovation import FusionVerdict
+from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
 from terrafix.estimator.integrity.signed_innovations import SignedInnovations
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
@@ -57,7 +57,8 @@ class PropagationResult:
     """Result of ``advance``. ``verdict``: on the odometry of the frame. ``step_m`` (2,): east, north since the frame
     before, by odometry alone, and its 1-sigma. ``verdicts``: on all measurements, and on a reset of the graph, in the
     order in which they were made. ``motion``: since the keyframe, by odometry, also of a fragment that is not
-    confirmed; None: there is none, or a graph has begun with the frame."""
+    confirmed; None: there is none, or a graph has begun with the frame. ``off``: of fused odometry from the prediction,
+    east and north; None: nothing predicts it."""
 
     verdict: Verdict
     placed: FrameState
@@ -65,6 +66,7 @@ class PropagationResult:
     step_sigma_m: float
     verdicts: tuple[FusionVerdict, ...] = ()
     motion: KeyframeMotion | None = None
+    off: Innovation | None = None
 
     @property
     def fused(self) -> bool:
@@ -338,7 +340,8 @@ class Propagation:
             for aid in self._aids:
                 aid.after_frame(last, frame.attitude)
         result = _result(predicted, last, step, [*verdicts, *of_links, *of_aids])
-        return replace(result, motion=predicted.odometry.motion)
+        off = predicted.odometry.motion_innovation
+        return replace(result, motion=predicted.odometry.motion, off=None if off is None else off.horizontal)
 
     def _linked(
         self, registered: RegisteredFrame

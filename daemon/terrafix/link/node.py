@@ -121,6 +121,7 @@ class LinkNode:
         self._silent = False
         self._no_fix_reason: fix_type.NoFixReason | None = None
         self._started_text_sent = False
+        self._faults: dict[str, tuple[CalibrationFault, Debounce[str]]] = {}  # newest of each quantity
         self._fix_debounce = Debounce[bool]()
         self._level_debounce = Debounce[int]()
         self._level_debounce.reported = 0
@@ -152,11 +153,12 @@ class LinkNode:
         return self._send(now_ns) if self._schedule.due(now_ns) else ()
 
     def _on_frame(self, frame: Frame) -> list[Message]:
-        faults = self._frame_load.on_frame(frame)
+        faults = self._frame_load.on_frame(frame, max(self._now_ns, frame.t_ns))
         return [*faults, *(text for fault in faults for text in self._on_calibration_fault(fault))]
 
     def _on_estimate(self, estimate: NavEstimate) -> list[Message]:
         now_ns = max(self._now_ns, estimate.emitted_at_ns)  # the last tick may be older than the estimate
+        self._frame_load.on_estimate(estimate)
         verdict, detail = self._gate.evaluate(estimate, now_ns, self._inertial, self._ground_amsl_m)
         if verdict is Verdict.ACCEPTED or (self._gate.pending_jump and detail == self._gate.pending_jump):
             self._newest_estimate_ns = max(self._newest_estimate_ns or 0, estimate.t_ns)
@@ -253,8 +255,16 @@ class LinkNode:
         return [statustext(hint.t_ns, INFO if hint.verdict is Verdict.ACCEPTED else WARNING, hint.text)]
 
     def _on_calibration_fault(self, fault: CalibrationFault) -> list[Message]:
-        warning = WARNING if fault.quantity in LINK_FAULTS else CRITICAL
-        return [statustext(fault.t_ns, warning if fault.active else INFO, fault_text(fault))]
+        _, debounce = self._faults.get(fault.quantity, (fault, Debounce[str]()))
+        self._faults[fault.quantity] = fault, debounce
+        return list(self._fault_texts(max(self._now_ns, fault.t_ns)))
+
+    def _fault_texts(self, now_ns: int) -> Iterator[StatusText]:
+        """Texts that are due, of the faults that have begun, changed or ended."""
+        for fault, debounce in self._faults.values():
+            text, warning = fault_text(fault), WARNING if fault.quantity in LINK_FAULTS else CRITICAL
+            if debounce.due(text, now_ns, clears=not fault.active):
+                yield statustext(now_ns, warning if fault.active else INFO, text)
 
     def _on_served_vehicle(self, served: ServedVehicle) -> list[Message]:
         self._candidates = served.candidates
@@ -263,6 +273,7 @@ class LinkNode:
     def _send(self, now_ns: int) -> Iterator[Message]:
         """-> GpsInput of this send time and texts for the pilot; no GpsInput after 35 s without an estimate."""
         yield from self._update_degradation(now_ns)
+        yield from self._fault_texts(now_ns)
         if self._armed is not False and (question := self._prior_request.due(now_ns)):  # not needed on the ground
             yield statustext(now_ns, WARNING, question)
         silent = self._newest_estimate_ns is not None and now_ns - self._newest_estimate_ns > fix_type.SILENCE_AFTER_NS

@@ -228,5 +228,7 @@ def test_images_that_are_squeezed_in_flight_contradict_inertial_readings(seed: i
     assert not result.lies()
     resets = [v for v in result.resets() if v.detail.endswith("to one side of the prediction")]
     assert resets and resets[0].frame_id * FRAME_S - FIRST * FRAME_S < 3.0
+    faults = [m for m in result.published if isinstance(m, CalibrationFault) and m.active]
+    assert (faults[0].quantity, faults[0].t_ns) == ("picture contradicts motion", resets[0].t_ns)
     assert result.contradicted
     assert result.is_back(3.0)

@@ -121,6 +121,23 @@ def test_a_stale_estimate_gives_fix_type_1_then_silence_and_recovers_immediately
     assert any("GPS_INPUT stopped" in t for t in texts(published))
 
 
+def test_an_old_estimate_is_moved_on_by_inertial_readings_as_long_as_its_accuracy_allows() -> None:
+    """Pictures that are 1.4 s late from one moment on: their estimates are 2.4 s old when the next one comes."""
+    late_ns, samples = 1_900 * MS, [(0, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0)]
+
+    def feed(now: int) -> list[m.Message]:
+        level = m.VehicleState(t_ns=now, source="mavlink", yaw_rad=1.57, roll_rad=0.0, pitch_rad=0.0)
+        readings = m.Imu(t_ns=now, source="mavlink", samples=samples)
+        ends = now < 20 * S
+        return [level, readings, *(every(500 * MS, estimate, late_ns)(now) if ends else [])]
+
+    published = gps_since(fly(LinkNode(10.0), 0, 26 * S, feed), 4 * S)
+    sent = [g for g in published if g.fix_type == 3]
+    assert all(g in sent for g in published if g.t_ns < 20 * S)
+    assert max(abs(east_error_m(g)) for g in sent) < 0.1
+    assert sent[-1].t_ns < 22 * S and sent[-1].speed_accuracy_mps < 1.5  # then it is too inaccurate
+
+
 @pytest.mark.parametrize(
     ("sigma_m", "sigma_mps", "fix_type"),
     [(4.0, 0.5, 3), (35.0, 0.5, 3), (60.0, 0.5, 1), (1e6, 0.5, 1), (4.0, 0.3, 3), (4.0, 1.0, 3), (4.0, 1.6, 1)],

@@ -266,7 +266,7 @@ STREAMED = (  # as a stream or its receiver fails in flight
         FOREIGN_S,
         lambda span: during(span, pictures.late_pictures(pictures.FOREIGN_LAG_S)),
         past_s=pictures.FOREIGN_LAG_S + 1.0,
-        cause="contradicts motion",
+        cause="contradicts motion|not on the map",
     ),
     Fault(
         "water",
@@ -340,7 +340,7 @@ LIVE = (  # which need a rig
         FOREIGN_S,
         process=Process(show_another_place, show_own_place),
         needs=frozenset({Need.ELSEWHERE}),
-        cause="contradicts motion",
+        cause="contradicts motion|not on the map",
     ),
     Fault(
         "telemetry comes twice",

@@ -20,11 +20,14 @@ def edited(flown: SimulatedFlight, fault: Fault) -> SimulatedFlight:
     known = {round(1e9 * shot.t_s): shot for shot in flown.frames}
     frames = [known.get(shot.frame.t_ns) or flown.at(shot.frame.t_ns / 1e9) for shot in found]
     pictures = [_picture(shot, true) for shot, true in zip(found, frames, strict=True)]
+    telemetry = [sorted((*shot.states, *shot.imu, *shot.others), key=lambda message: message.t_ns) for shot in found]
+    if fault.source is not None:  # of a stream
+        telemetry[0] = [msgspec.structs.replace(found[0].frame, buffered=True), *telemetry[0]]
     changed = replace(
         flown,
         frames=frames,
         pictures=pictures,
-        telemetry=[sorted((*shot.states, *shot.imu, *shot.others), key=lambda message: message.t_ns) for shot in found],
+        telemetry=telemetry,
         path_m=np.interp([shot.t_s for shot in frames], times_s, flown.path_m),
         lie=None if fault.is_true else span,
     )

@@ -4,13 +4,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafix.core.gate import MIN_COMPONENT_WEIGHT
+from terrafix.messages import STAMP_SIGMA_S
+
 STEP_S = 0.05  # s: of the grid of offsets [tuned]
 # s: two seconds early (late telemetry), three late: what the camera source lets pass [spec: vision/sources/camera.py]
 DRIFT_GRID_S = np.arange(-2.0, 3.0001, STEP_S)
+# Probabilities of the offset of an empty buffer. [spec: STAMP_SIGMA_S]
+EMPTY_BUFFER = np.exp(-0.5 * (DRIFT_GRID_S / STAMP_SIGMA_S) ** 2)
+EMPTY_BUFFER /= EMPTY_BUFFER.sum()
 RESOLUTION_S2 = STEP_S**2 / 12.0  # s^2 [spec: variance of a uniform density over a grid cell]
 # s/s at which an offset may drift; 0 first. A buffer fills by what a receiver is slower: 2 to 40 %, and empties again.
 RATES = np.array([0.0, -0.4, -0.1, 0.02, 0.05, 0.1, 0.2, 0.4])  # [spec: the last one fills the grid in 8 s]
+# Of an offset that jumps the share that becomes that of an empty buffer: a stream that is opened again, or catches up.
+FLUSHED_SHARE = 0.5  # [spec: a fault ends as often as one begins]
 STOP_HZ = 1.0 / 20.0  # a drift ends after 20 s in the mean: a buffer is full [spec: half of 2 s in 40 s]
+# Share of the repeats after which a stream is as much later: one that repeats a picture to fill a gap goes on live.
+HELD_SHARE = 2.0 * MIN_COMPONENT_WEIGHT  # [spec: the claim contains it at once]
 
 
 @dataclass(frozen=True)
@@ -28,8 +38,17 @@ def predicted(mass: np.ndarray, dt_s: float, hazards: Hazards) -> np.ndarray:
     moved = np.array([_shifted(row, rate * dt_s / STEP_S) for row, rate in zip(mass, RATES, strict=True)])
     after = transitions(dt_s, hazards).T @ moved
     jump = _chance(hazards.jump_hz, dt_s)
-    after[0] += jump * (float(moved[0].sum()) / len(DRIFT_GRID_S) - moved[0])
+    anywhere = FLUSHED_SHARE * EMPTY_BUFFER + (1.0 - FLUSHED_SHARE) / len(DRIFT_GRID_S)
+    after += jump * (np.outer(np.arange(len(RATES)) == 0, float(after.sum()) * anywhere) - after)
     return np.asarray(after)
+
+
+def held(mass: np.ndarray, held_s: float) -> np.ndarray:
+    """``mass`` (R, L) after a stream has repeated pictures for ``held_s``: they may lie in its buffer since, or others
+    of before."""
+    later = np.array([_shifted(row, held_s / STEP_S) for row in mass])
+    later[0] = 0.5 * (later[0] + float(later[0].sum()) / len(DRIFT_GRID_S))
+    return np.asarray((1.0 - HELD_SHARE) * mass + HELD_SHARE * later)
 
 
 def transitions(dt_s: float, hazards: Hazards) -> np.ndarray:

@@ -10,7 +10,7 @@ Markov chain over offset and rate on a grid, a point mass filter (Bucy and Senne
 or jumping. How often it begins to drift depends on the source."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from terrafix.estimator.integrity.offset_drift import (
     RATES,
     RESOLUTION_S2,
     Hazards,
+    held,
     predicted,
     transitions,
 )
@@ -71,12 +72,14 @@ QUANTITY = "camera time"
 @dataclass(frozen=True)
 class Contradiction:
     """A frame at the uncorrected ``t_ns``, which images or map place ``off`` the estimate (2,), which moves with
-    ``velocity_mps`` (2,) at ``agl_m`` above the ground."""
+    ``velocity_mps`` (2,) at ``agl_m`` above the ground. ``agreed_sigma_s``: 1-sigma of the offset with which that
+    agrees."""
 
     t_ns: int
     off: Innovation
     velocity_mps: np.ndarray
     agl_m: float
+    agreed_sigma_s: float = 0.0
 
     def back_m(self, agreed_s: float, telemetry: Telemetry) -> np.ndarray:
         """(2, L): from the place at each offset to that at the offset ``agreed_s``, with which the estimate agrees."""
@@ -89,7 +92,8 @@ class Contradiction:
 
     @property
     def _cov_m2(self) -> np.ndarray:
-        return np.asarray(self.off.covariance + RESOLUTION_S2 * np.outer(self.velocity_mps, self.velocity_mps))
+        along_s2 = RESOLUTION_S2 + self.agreed_sigma_s**2
+        return np.asarray(self.off.covariance + along_s2 * np.outer(self.velocity_mps, self.velocity_mps))
 
     def density(self, back_m: np.ndarray) -> np.ndarray:
         """(L,) likelihood [1/m^2] of each offset, ``back_m`` (2, L)."""
@@ -157,8 +161,10 @@ class TimeOffset:
         self._density: np.ndarray | None = None  # of the newest frame
         self._reported_s: float | None = None
         # Offset with which position and images agreed at last, where they do not now; what has contradicted since.
-        self._agreed_s: float | None = None
+        self._agreed: tuple[float, float] | None = None  # its mean and 1-sigma
+        self._new_ns, self._repeated_ns = 0, 0  # stamp of the newest frame with a new view, and of a repeat since
         self._contradicted: set[str] = set()
+        self._held = False  # repeats came before the newest new view, and the map has not agreed since
         self._jumps = False  # what has contradicted is known, and not subtracted yet
 
     def stamped(self, frame: Frame) -> None:
@@ -190,28 +196,52 @@ class TimeOffset:
 
     def agree(self) -> None:
         """The map has confirmed the position, or moved it to where the images are."""
-        self._agreed_s, self._contradicted, self._jumps = None, set(), False
+        self._jumps, self._held = self._jumps and self._held, False  # a match of the frame that jumped, at its old time
+        self._agreed, self._contradicted = None, set()
 
     def contradict(self, seen: Contradiction, telemetry: Telemetry, *, by_map: bool) -> None:
         """An offset that jumps moves the image along the way that was flown. A wrong motion of images lies along it,
         too, or anywhere, as a wrong pose on the map does (``by_map``). The first of each counts: those that follow
         repeat it."""
         kind, rate = ("map", P_REJECTED) if by_map else ("images", P_IMPLAUSIBLE)
-        if kind in self._contradicted or (abs(self.estimate[0] - self.applied_s) > FAR_S and not self._contradicted):
-            return  # a correction that is under way moves the frames as well
+        under_way = self._agreed is None and abs(self.estimate[0] - self.applied_s) > FAR_S
+        if kind in self._contradicted or under_way:  # a correction that is under way moves the frames as well
+            return
         self._contradicted.add(kind)
-        if self._agreed_s is None:
-            self._agreed_s = self.estimate[0]
+        agreed_s, sigma_s = self._agreed = self._agreed or self._agreement
+        seen = replace(seen, agreed_sigma_s=sigma_s)
         self.forget_images()
         since_s = 0.0 if self._at_ns is None else (seen.t_ns - self._at_ns) * 1e-9
         mass = predicted(self._mass, since_s, self._hazards)
-        jumped = seen.density(seen.back_m(self._agreed_s, telemetry))
+        jumped = seen.density(seen.back_m(agreed_s, telemetry))
         anywhere = 1.0 / (2.0 * seen.agl_m) ** 2  # in what the camera sees
         if not by_map:
             anywhere = 0.5 * (anywhere + seen.density_across / (2.0 * seen.agl_m))
         mass *= jumped + rate * anywhere
         self._jumps = True
         self._mass, self._at_ns, self._density = mass / mass.sum(), max(seen.t_ns, self._at_ns or seen.t_ns), None
+
+    def view(self, t_ns: int, *, repeated: bool) -> None:
+        """A frame shows a new view of the ground, or one of before. Repeats may have gone into a buffer: the next new
+        view decides (``contradict``)."""
+        if repeated:
+            self._repeated_ns = t_ns
+            return
+        held_s, self._new_ns = (self._repeated_ns - self._new_ns) * 1e-9, t_ns
+        if 0.0 < held_s <= DRIFT_GRID_S[-1] and self.buffered:
+            self._agreed, self._contradicted, self._held = self._agreed or self._agreement, set(), True
+            self._mass, self._density = held(self._mass, held_s), None
+
+    @property
+    def _agreement(self) -> tuple[float, float]:
+        """Offset with which the estimate agrees, and its 1-sigma."""
+        mean_s = self.estimate[0]
+        return mean_s, self._claim_about(mean_s)
+
+    @property
+    def is_held(self) -> bool:
+        """Repeats may be in a buffer: how the newest view lies tells whether they are."""
+        return self._agreed is not None and not self._contradicted
 
     @property
     def density(self) -> np.ndarray:
@@ -233,12 +263,14 @@ class TimeOffset:
 
         The prior's sigma limits it until the probability of an offset that transfer does not explain reaches
         MIN_COMPONENT_WEIGHT, where it affects a 95 % ellipse."""
-        remaining_s = self._sigma_about(self.applied_s)
+        remaining_s = self._claim_about(self.applied_s)
         if float(self.density[-2:].sum() + self.density[:2].sum()) >= MIN_COMPONENT_WEIGHT:
             return max(remaining_s, OUTSIDE_S)
-        return (
-            remaining_s if self._far(self.applied_s) >= MIN_COMPONENT_WEIGHT else min(remaining_s, self._prior_sigma_s)
-        )
+        return remaining_s
+
+    def _claim_about(self, from_s: float) -> float:
+        sigma_s = self._sigma_about(from_s)
+        return sigma_s if self._far(from_s) >= MIN_COMPONENT_WEIGHT else min(sigma_s, self._prior_sigma_s)
 
     def step(self, dt_s: float) -> bool:
         """Moves ``applied_s`` towards the estimate where that is known and not 0, towards 0 where it is 0; elsewhere it

@@ -14,7 +14,14 @@ from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientat
 from terrafix.estimator.monitors.image_shape import ShapeMonitor
 from terrafix.estimator.monitors.inertial import MOUNT_YAWS_DEG, InertialMonitor
 from terrafix.estimator.monitors.levelling import LevellingMonitor
-from terrafix.estimator.monitors.map_offsets import HEIGHT_NOISE, OffsetMonitor, log_height_ratio
+from terrafix.estimator.monitors.map_offsets import (
+    HEIGHT_CHANGE_NOISE,
+    HEIGHT_CHANGE_SIGMA,
+    HEIGHT_NOISE,
+    ChangeMonitor,
+    OffsetMonitor,
+    log_height_ratio,
+)
 from terrafix.estimator.monitors.registration import Registration
 from terrafix.estimator.monitors.turns import TurnMonitor
 from terrafix.estimator.monitors.visual_motion import visual_motion
@@ -27,8 +34,10 @@ MIN_TURN_SPACING_S = 1.0  # s between turns that count: images of one keyframe s
 MATCH_HEADING_SIGMA_RAD, HEIGHT_SIGMA_SHARE = math.radians(10.0), 0.05
 YAW_NOISE_RAD = math.radians(3.0)  # 1-sigma of the heading of one pose against the reported one [tuned]
 REPORT_CHANGE = 0.2  # relative change of a factor or an angle after which a fault is reported again [tuned]
-# Faults whose images are refused from the frame on that shows them: the rest of the estimate is right.
-REFUSED_PICTURES = frozenset(orientation.quantity for orientation in ORIENTATIONS)
+FOCAL = "focal length"
+# Faults that the claim contains: images that are refused from the frame on that shows them; the height by a lens that
+# zooms, whose images move the position no more than the map and inertial readings allow.
+CLAIMED = frozenset((FOCAL, *(orientation.quantity for orientation in ORIENTATIONS)))
 # Verdicts on frames that were not correlated with the map.
 NOT_CORRELATED = (
     Verdict.BAD_IMAGE,
@@ -65,6 +74,7 @@ class Monitors:
         heading = math.hypot(MATCH_HEADING_SIGMA_RAD, math.radians(origin.yaw_sigma_deg))
         self._heading = OffsetMonitor(heading, YAW_NOISE_RAD)
         self._height: OffsetMonitor | None = None  # None until a height is reported
+        self._focal = ChangeMonitor(HEIGHT_CHANGE_SIGMA, HEIGHT_CHANGE_NOISE)
         self._times_ns: dict[int, int] = {}  # frame -> time, of frames that may be the keyframe of a later one
         self._turned_s = -math.inf  # time of the last turn that counted
         self._textured: int | None = None  # the newest frame with accepted odometry
@@ -74,9 +84,14 @@ class Monitors:
     @property
     def sigma_m(self) -> float:
         """1-sigma per horizontal axis, to be added to the published covariance."""
-        if any(quantity not in REFUSED_PICTURES for quantity in self._reported):
+        if any(quantity not in CLAIMED for quantity in self._reported):
             return max(FAULT_SIGMA_M, self._registration.path_error_m)
         return 0.0
+
+    @property
+    def focal_changed(self) -> bool:
+        """Images show the ground larger or smaller than before."""
+        return self._focal.active
 
     @property
     def path_error_m(self) -> float:
@@ -159,6 +174,7 @@ class Monitors:
                 )
                 self._height = OffsetMonitor(sigma, HEIGHT_NOISE)
             self._height.add(log_height_ratio(reported_m, observed_m))
+            self._focal.add(log_height_ratio(reported_m, observed_m))
 
     def take_changes(self, t_ns: int) -> list[CalibrationFault]:
         """Faults that have begun, changed or ended since the last call."""
@@ -197,6 +213,9 @@ class Monitors:
             found["scale"] = Finding(
                 math.exp(self._height.mean), "reported heights differ from the heights of map matches"
             )
+        elif self._focal.active:
+            detail = "heights of map matches have changed, and reported ones have not: a lens that zooms, or high trees"
+            found[FOCAL] = Finding(math.exp(self._focal.mean), detail)
         if self._heading.active:
             found["heading"] = Finding(
                 math.degrees(self._heading.mean), "reported headings differ from the headings of map matches"

@@ -12,9 +12,9 @@ from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.link.integrity.output_predictor import PredictedState
 from terrafix.messages import SourceLabel
 
-# Age of the estimate up to which the link predicts it, ns. Beyond it the autopilot's own inertial dead reckoning is
-# better (0.2 to 0.5 m after 3 s of silence, measured on the firmware) than constant velocity, and silence of up to 4 s
-# has no effect on the autopilot. [tuned]
+# Age of the estimate up to which the link predicts it without inertial readings, ns. Beyond it the autopilot's own
+# inertial dead reckoning is better (0.2 to 0.5 m after 3 s of silence, measured on the firmware) than constant
+# velocity, and silence of up to 4 s has no effect on the autopilot. With readings its accuracy decides. [tuned]
 MAX_PREDICTION_AGE_NS = 2_000_000_000
 SILENCE_AFTER_NS = 35_000_000_000  # ns; last degradation level, by then every vehicle has rejected this GPS [tuned]
 MAX_HORIZONTAL_SIGMA_M = 50.0  # m; the autopilot's gate is 7 times this, above it any position would pass [tuned]
@@ -104,7 +104,8 @@ class FixGate:
     def _no_fix_reason(
         self, predicted: PredictedState, accuracy_m: float, level: int, label: SourceLabel
     ) -> NoFixReason | None:
-        if predicted.age_s * 1e9 > (MAX_PREDICTION_AGE_NS if self.has_fix or self._sent is None else RECOVERY_AGE_NS):
+        limit_ns = MAX_PREDICTION_AGE_NS if self.has_fix or self._sent is None else RECOVERY_AGE_NS
+        if predicted.age_s * 1e9 > limit_ns and not predicted.inertial:
             return NoFixReason(f"estimate is {predicted.age_s:.1f} s old", "the estimate is too old")
         if label is SourceLabel.NOT_PLACED:
             return NOT_PLACED

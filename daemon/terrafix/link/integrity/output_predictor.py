@@ -47,7 +47,8 @@ class LateralAcceleration:
 
 @dataclass(frozen=True)
 class PredictedState:
-    """An estimate predicted to ``t_ns`` (the present). ``age_s``: length of the prediction."""
+    """An estimate predicted to ``t_ns`` (the present). ``age_s``: length of the prediction; ``inertial``: readings
+    cover all of it."""
 
     t_ns: int
     age_s: float
@@ -58,6 +59,7 @@ class PredictedState:
     horizontal_sigma_m: float  # 1-sigma along the worst horizontal axis
     vertical_sigma_m: float
     speed_sigma_mps: float  # 1-sigma of the velocity in its worst direction
+    inertial: bool
 
 
 class InertialBuffer:
@@ -150,6 +152,7 @@ def predict_to(estimate: NavEstimate, now_ns: int, inertial: InertialBuffer) -> 
         horizontal_sigma_m=math.sqrt(worst_horizontal_variance(estimate.cov) + process_noise_m2),
         vertical_sigma_m=math.sqrt(max(0.0, estimate.cov[UU]) + process_noise_m2) if estimate.amsl_known else math.inf,
         speed_sigma_mps=math.hypot(estimate.velocity_sigma_mps, accel_sigma * age_s, heading_error_mps),
+        inertial=increments is not None,
     )
 
 

@@ -33,6 +33,10 @@ def fault_text(fault: CalibrationFault) -> str:
             return f"camera {fault.factor:.1f} s late: corrected" if fault.factor else "camera time is right again"
         late, which = abs(fault.factor), "camera" if fault.factor > 0.0 else "telemetry"
         return f"{which} {late:.1f} s late: check its buffers"
+    if fault.quantity == "focal length" and fault.active and fault.factor is not None:
+        return f"focal or ground height seems x{fault.factor:.2f} off"
+    if fault.quantity == "picture not on the map":
+        return fault.quantity if fault.active else "the picture is on the map again"
     if fault.quantity.startswith("picture"):
         turned = "" if fault.factor is None else f" by {fault.factor:.0f} deg"
         return f"{fault.quantity}{turned}: not used" if fault.active else "the picture is right again"

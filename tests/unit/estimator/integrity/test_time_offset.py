@@ -265,6 +265,36 @@ def test_an_image_that_jumps_along_the_track_is_one_of_another_time_and_one_besi
     assert offset.applied_s == pytest.approx(late_s, abs=0.1) and offset.sigma_s < 0.2 and not offset.step(0.5)
 
 
+@pytest.mark.parametrize(("repeats", "off_m", "late_s"), [(1, -10.0, 0.5), (3, -30.0, 1.5), (1, 0.0, 0.0)])
+def test_pictures_that_a_stream_repeats_are_late_by_as_much_from_then_on_or_not_at_all(
+    repeats: int, off_m: float, late_s: float
+) -> None:
+    """At 2 Hz and 20 m/s; the first new image decides."""
+    offset = TimeOffset(R_B_C)
+    offset.buffered = True
+    for i in range(5 + repeats + 1):
+        offset.view(i * 500_000_000, repeated=5 <= i < 5 + repeats)
+    held_sigma_s = offset.sigma_s
+    off = Innovation(np.array([off_m, 0.5]), 2.0 * np.eye(2), GATE[2])
+    offset.contradict(Contradiction(0, off, np.array([20.0, 0.0]), 120.0), Telemetry(), by_map=False)
+    offset.agree()  # a match of the same frame, at its old time
+    assert offset.estimate[0] == pytest.approx(late_s, abs=0.1) and offset.step(0.5) == (late_s > 0.0)
+    assert offset.applied_s == pytest.approx(late_s, abs=0.1) and offset.sigma_s < 0.1 < held_sigma_s
+
+
+def test_a_stream_that_catches_up_has_an_empty_buffer() -> None:
+    """Its images have jumped back by 1.3 s more or less, of 1.4 s."""
+    offset, speed_mps = TimeOffset(R_B_C), np.array([20.0, 0.0])
+    offset.buffered = True
+    for t_s, off_m in ((0, -28.0), (20, 26.0)):
+        off = Innovation(np.array([off_m, 0.0]), (4.0 if t_s else 1.0) * np.eye(2), GATE[2])
+        for by_map in (False, True):
+            offset.contradict(Contradiction(t_s * 10**9, off, speed_mps, 120.0), Telemetry(), by_map=by_map)
+        assert offset.step(0.5)
+        offset.agree()
+    assert offset.applied_s == pytest.approx(0.0, abs=0.03)
+
+
 def test_a_vehicle_that_hovers_learns_nothing_of_the_time_from_an_image_that_jumps() -> None:
     offset, before = TimeOffset(R_B_C), TimeOffset(R_B_C)
     off = Innovation(np.array([-20.0, 0.0]), np.eye(2), GATE[2])

@@ -19,7 +19,13 @@ from terrafix.estimator.monitors.calibration_monitors import FAULT_SIGMA_M, Moni
 from terrafix.estimator.monitors.cusum import MARGIN, MAX_STEP, Cusum, threshold
 from terrafix.estimator.monitors.image_shape import ASPECT_RATIOS, ShapeMonitor
 from terrafix.estimator.monitors.inertial import MIN_CHANGE_MPS, MIN_WINDOW_S, MOUNT_YAWS_DEG, InertialMonitor
-from terrafix.estimator.monitors.map_offsets import OffsetMonitor, log_height_ratio
+from terrafix.estimator.monitors.map_offsets import (
+    HEIGHT_CHANGE_NOISE,
+    HEIGHT_CHANGE_SIGMA,
+    ChangeMonitor,
+    OffsetMonitor,
+    log_height_ratio,
+)
 from terrafix.estimator.monitors.registration import ERROR_PER_PATH, REGISTRATION_SPACING_HEIGHTS, Registration
 from terrafix.estimator.monitors.turns import TurnMonitor
 from terrafix.estimator.monitors.visual_motion import visual_motion
@@ -202,6 +208,15 @@ def test_constant_errors_beyond_three_sigmas_raise_an_alarm_with_their_size() ->
             monitor.add(off + rng.normal(0.0, 0.03))
         assert monitor.active is alarm
         assert monitor.mean == pytest.approx(off, abs=0.05)
+
+
+@pytest.mark.parametrize("usual", [0.0, 0.2])
+def test_a_lens_that_zooms_is_an_alarm_and_a_constant_error_of_height_is_none(usual: float) -> None:
+    monitor, rng, alarms = ChangeMonitor(HEIGHT_CHANGE_SIGMA, HEIGHT_CHANGE_NOISE), np.random.default_rng(1), []
+    for zoom in [1.0] * 300 + np.linspace(1.0, 1.3, 20).tolist() + [1.0] * 20:
+        monitor.add(usual + math.log(zoom) + rng.normal(0.0, 0.02))
+        alarms.append(monitor.active)
+    assert not any(alarms[:300]) and any(alarms[300:320]) and not alarms[-1]
 
 
 def test_the_log_height_ratio_of_feet_for_metres_is_log_3_28() -> None:

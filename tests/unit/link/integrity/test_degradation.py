@@ -12,7 +12,7 @@ from link_wire import WiredEdge, heartbeat
 from terrafix import messages as m
 from terrafix.link.node import LinkNode
 from terrafix.link.pilot_text.debounce import MAX_TEXT_INTERVAL_NS, RESET_AFTER_NS, Debounce
-from terrafix.link.pilot_text.statustext import LINK_FAULTS
+from terrafix.link.pilot_text.statustext import LINK_FAULTS, TWO_SENDERS
 
 MAX_CHARACTERS = 50  # characters of STATUSTEXT
 KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
@@ -25,7 +25,7 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"GPS_INPUT stopped: no estimate for 35 s",
     r"estimator (died|stuck|gave up)",
     r"computer is (normal|hot|critical)(, -?\d+ C)?",
-    r"computer (too slow: [\d.]+ of [\d.]+ Hz|keeps up again)",
+    r"computer (too slow: \d+ of \d+ frames late|keeps up again)",
     r"telemetry of (two senders, one ignored|one sender again)",
     r"(autopilot rebooted, or its time jumps|the autopilot's time is steady again)",
     r"(attitude jumps without gyros, ignored|the attitude is steady again)",
@@ -46,8 +46,9 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"mirrored picture: no fix",
     r"picture squeezed by 1\.(19|33) in [xy]: no fix",
     r"picture (upside down|mirrored|turned by -?90 deg): not used",
-    r"the picture is right again",
-    r"(scale|heading|mount yaw|mirrored picture|aspect ratio) is plausible again",
+    r"(the picture is right again|picture not on the map|the picture is on the map again)",
+    r"focal or ground height seems x[\d.]+ off",
+    r"(focal length|scale|heading|mount yaw|mirrored picture|aspect ratio) is plausible again",
     r"autopilot (does not use the position|uses a position again)",
 ]
 
@@ -171,6 +172,13 @@ def test_named_values_are_sent_once_a_second_after_an_autopilot_is_connected() -
     assert math.isnan(lost["TFX_ACC_M"]) and math.isnan(lost["TFX_MAP_S"])
 
 
+def told_of(fault: m.CalibrationFault, lasts_ns: int = 6 * S) -> list[m.StatusText]:
+    """Texts about a fault that begins, and ends ``lasts_ns`` later."""
+    node, end_ns = LinkNode(10.0), fault.t_ns + lasts_ns
+    published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, t_ns=end_ns, active=False))]
+    return [message for message in published if isinstance(message, m.StatusText)]
+
+
 @pytest.mark.parametrize(
     ("quantity", "factor"),
     [
@@ -184,10 +192,7 @@ def test_named_values_are_sent_once_a_second_after_an_autopilot_is_connected() -
     ],
 )
 def test_a_calibration_fault_and_its_end_are_reported_to_the_pilot(quantity: str, factor: float | None) -> None:
-    node = LinkNode(10.0)
-    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True)
-    published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
-    began, ended = (message for message in published if isinstance(message, m.StatusText))
+    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
     assert is_known(began.text) and began.text.endswith("no fix") and began.severity == 2
     assert is_known(ended.text) and "no fix" not in ended.text and ended.severity == 6
 
@@ -198,19 +203,46 @@ def test_a_calibration_fault_and_its_end_are_reported_to_the_pilot(quantity: str
 def test_a_picture_that_turns_in_flight_is_reported_to_the_pilot_as_not_used(
     quantity: str, factor: float | None
 ) -> None:
-    node = LinkNode(10.0)
-    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True)
-    published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
-    began, ended = (message for message in published if isinstance(message, m.StatusText))
+    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
     assert is_known(began.text) and quantity in began.text and began.text.endswith("not used") and began.severity == 2
     assert ended.text == "Terrafix: the picture is right again" and ended.severity == 6
 
 
+@pytest.mark.parametrize(
+    ("quantity", "factor", "text"),
+    [("focal length", 1.28, "focal or ground height seems x1.28 off"), ("picture not on the map", None, None)],
+)
+def test_a_fault_that_the_claim_contains_is_told_without_a_word_of_the_fix(
+    quantity: str, factor: float | None, text: str | None
+) -> None:
+    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
+    assert began.text == f"Terrafix: {text or quantity}" and ended.severity == 6
+    assert is_known(began.text) and is_known(ended.text)
+
+
 @pytest.mark.parametrize("quantity", LINK_FAULTS)
 def test_telemetry_and_frames_that_are_left_out_are_a_warning_by_their_cause(quantity: str) -> None:
-    node = LinkNode(10.0)
-    fault = m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail="0.8 of 2.0 Hz", active=True)
-    published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, active=False))]
-    began, ended = (message for message in published if isinstance(message, m.StatusText))
+    detail = "6 of 10 frames late"
+    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail=detail, active=True))
     assert is_known(began.text) and quantity in began.text and began.severity == 4
     assert is_known(ended.text) and ended.severity == 6
+
+
+def test_a_fault_that_comes_and_goes_is_told_seldom_and_its_last_state_is() -> None:
+    fault = m.CalibrationFault(t_ns=0, quantity=TWO_SENDERS, factor=None, detail="", active=True)
+
+    def feed(now_ns: int) -> list[m.Message]:
+        if now_ns % S or now_ns >= 61 * S:
+            return []
+        return [msgspec.structs.replace(fault, t_ns=now_ns, active=now_ns // S % 2 == 0)]
+
+    told = [text for text in texts(fly(LinkNode(10.0), 0, 130 * S, feed)) if "sender" in text]
+    assert len(told) <= 8 and told[-1] == f"Terrafix: {TWO_SENDERS}, one ignored"
+
+
+def test_a_text_has_the_time_at_which_it_is_sent_not_that_at_which_its_fault_began() -> None:
+    fault = m.CalibrationFault(t_ns=S, quantity=TWO_SENDERS, factor=None, detail="", active=True)
+    node = LinkNode(10.0)
+    list(node.tick(9 * S))
+    (text,) = [x for x in node.on(fault) if isinstance(x, m.StatusText)]
+    assert text.t_ns == 9 * S
