@@ -1,4 +1,4 @@
-"""Whole recorded flights through the nodes of the daemon: accuracy, consistency, determinism and memory."""
+"""Whole recorded flights through the nodes of the daemon: accuracy, consistency and memory."""
 
 import csv
 import json
@@ -16,12 +16,11 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix_tools.evaluate import evaluate, truth_sigma_of
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.run import finalise, flights_of
-from terrafix_tools.replay import replay
 
 pytestmark, NIGHTLY = pytest.mark.slow, pytest.mark.nightly
+MODELS = [("village-1", ""), ("town-a", ""), ("town-a", "xfeat"), pytest.param("village-1", "xfeat", marks=NIGHTLY)]
 
 DataSet = Callable[[str], Path]
-FIRST_FRAMES = 25
 THIRD, WHOLE = 120, 358  # frames of village-1; town-a has fewer
 NAMES = ("village-1", "town-a")
 MAPS = {"village-1": "village-2014-01.tif", "town-a": "town.tif"}
@@ -220,21 +219,6 @@ def test_a_flight_on_a_map_of_another_season_has_no_false_fixes(fly: Fly) -> Non
     assert result["frames"] == THIRD
     assert result["within_50m"] >= 0.85
     assert result["false_fixes"] == 0
-
-
-def test_two_replays_of_a_flight_give_identical_estimates(fly: Fly, data_set: DataSet, tmp_path: Path) -> None:
-    """In two processes, whose hashes have different seeds, and whatever frames follow. Refined positions have their
-    test in a flight of the closed loop."""
-    flight, out, _ = fly("village-1", MAPS["village-1"])
-    short = short_flight(flight, tmp_path / "flight", FIRST_FRAMES)
-    replay(short, data_set(f"maps/{MAPS['village-1']}"), tmp_path / "out")
-    again, whole = rows_of(tmp_path / "out"), rows_of(out)[:FIRST_FRAMES]
-    kept = [name for name in again[0] if name != "process_ms" and not name.startswith("refined_")]
-    assert len(again) == FIRST_FRAMES and len(kept) > 10
-    assert [[row[name] for name in kept] for row in again] == [[row[name] for name in kept] for row in whole]
-
-
-MODELS = [("village-1", ""), ("town-a", ""), ("town-a", "xfeat"), pytest.param("village-1", "xfeat", marks=NIGHTLY)]
 
 
 @pytest.mark.parametrize(("name", "model"), MODELS)
