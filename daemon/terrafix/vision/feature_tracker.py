@@ -12,7 +12,7 @@ from terrafix.core.node import Image
 from terrafix.messages import Verdict
 from terrafix.vision.covisibility import Covisibility, DescribedImage
 from terrafix.vision.features import NO_POINTS, FeatureMatcher, SiftMatcher
-from terrafix.vision.patch_alignment import align_patches
+from terrafix.vision.patch_alignment import align_patches, there_and_back
 from terrafix.vision.two_view import (
     RANSAC_PX,
     TwoView,
@@ -28,8 +28,8 @@ WORK_WIDTH_PX = 720  # resolves 0.2 m from 100 m; small enough for 10 frames per
 DETAIL_WIDTH_PX, DETAIL_FEATURES = 1200, 2000
 MAX_CORNERS = 400
 MIN_CORNER_DISTANCE_PX = 12
-KLT_WINDOW_PX = 21
 KLT_LEVELS = 4
+SAMPLED = 8  # of so many corners one shows whether KLT follows at all [spec: 50 of MAX_CORNERS]
 TRACK_RETURN_PX = 1.0  # forward-backward check: larger return error rejects a track (Kalal 2010)
 TRACK_MIN_INLIERS = 20
 TRACK_MIN_INLIER_RATIO = 0.35
@@ -195,16 +195,12 @@ class FrameTracker:
         their positions (N, 2) px in this frame, and the number of tracked corners."""
         if self._last_gray is None or len(self._last_points) < TRACK_MIN_INLIERS:
             return _NONE, NO_POINTS, 0
-        window = (KLT_WINDOW_PX, KLT_WINDOW_PX)
         start = self._last_points.reshape(-1, 1, 2)
-        ahead, ok, _ = cv2.calcOpticalFlowPyrLK(
-            self._last_gray, gray, start, np.zeros_like(start), winSize=window, maxLevel=KLT_LEVELS
-        )
-        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
-            gray, self._last_gray, ahead, start.copy(), winSize=window, maxLevel=KLT_LEVELS
-        )
-        closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < TRACK_RETURN_PX
-        keep = (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed
+        if keyframe.view is not None:  # features were needed since: photos of which KLT can follow few
+            _, came_back = there_and_back(self._last_gray, gray, start[::SAMPLED].copy(), TRACK_RETURN_PX, KLT_LEVELS)
+            if SAMPLED * came_back.sum() < TRACK_MIN_INLIERS / 2:
+                return _NONE, NO_POINTS, 0
+        ahead, keep = there_and_back(self._last_gray, gray, start, TRACK_RETURN_PX, KLT_LEVELS)
         positions, index = ahead.reshape(-1, 2)[keep], self._last_index[keep]
         inlier = homography_inliers(keyframe.corners[index], positions)
         if inlier.sum() >= TRACK_MIN_INLIERS:

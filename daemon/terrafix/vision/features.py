@@ -91,9 +91,13 @@ def mutual_nearest(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
     if len(first) < 2 or len(second) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     # Squared distances. SIFT's descriptors are whole numbers up to 255, so that these are exact on every processor.
-    distance2 = np.square(first).sum(axis=1)[:, None] + np.square(second).sum(axis=1) - 2.0 * (first @ second.T)
-    index, nearest, back = np.arange(len(first)), distance2.argmin(axis=1), distance2.argmin(axis=0)
+    distance2 = first @ (-2.0 * second.T)
+    distance2 += np.square(first).sum(axis=1)[:, None]
+    distance2 += np.square(second).sum(axis=1)
+    index, nearest = np.arange(len(first)), distance2.argmin(axis=1)
     best = distance2[index, nearest]
     distance2[index, nearest] = np.inf
-    good = (back[nearest] == index) & (best < SIFT_RATIO**2 * distance2.min(axis=1))
-    return index[good], nearest[good]
+    clear = np.flatnonzero(best < SIFT_RATIO**2 * distance2.min(axis=1))
+    distance2[index, nearest] = best
+    good = distance2[:, nearest[clear]].argmin(axis=0) == clear  # down the columns of these alone
+    return clear[good], nearest[clear[good]]

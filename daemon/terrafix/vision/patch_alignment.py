@@ -6,7 +6,8 @@ import numpy as np
 from terrafix.vision.two_view import fit_homography
 
 WINDOW_PX = 21
-PATCH_RETURN_PX = 0.5  # forward-backward check (Kalal 2010)
+PATCH_RETURN_PX = 0.5  # forward-backward check
+CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 0.01)  # of the flow [spec: OpenCV's default]
 PYRAMID_LEVELS = 1  # pyramid levels; patches are first warped by a homography and then match within a pixel or two
 
 
@@ -24,23 +25,20 @@ def align_patches(
     warped = cv2.warpPerspective(from_gray, h, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
     start = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), h)
     guess = tracked.reshape(-1, 1, 2)
-    aligned, found = _flow(warped, gray, start, guess)
-    back, found_back = _flow(gray, warped, aligned, start)
-    closed = np.linalg.norm((back - start).reshape(-1, 2), axis=1) < PATCH_RETURN_PX
+    aligned, found = there_and_back(warped, gray, start, PATCH_RETURN_PX, PYRAMID_LEVELS, guess)
     near = np.linalg.norm((aligned - guess).reshape(-1, 2), axis=1) < max_shift_px
-    keep = np.flatnonzero(found & found_back & closed & near)
+    keep = np.flatnonzero(found & near)
     return aligned.reshape(-1, 2)[keep], keep
 
 
-def _flow(a: np.ndarray, b: np.ndarray, points: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lucas-Kanade flow from an initial guess. -> positions (N, 1, 2) px in ``b``, found (N,) bool."""
-    flowed, ok, _ = cv2.calcOpticalFlowPyrLK(
-        a,
-        b,
-        points,
-        guess.copy(),
-        winSize=(WINDOW_PX, WINDOW_PX),
-        maxLevel=PYRAMID_LEVELS,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )
-    return np.asarray(flowed), np.asarray(ok).ravel() == 1
+def there_and_back(
+    a: np.ndarray, b: np.ndarray, points: np.ndarray, return_px: float, levels: int, guess: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lucas-Kanade flow of ``points`` (N, 1, 2) px from one image to the other and back (Kalal 2010), in a pyramid of
+    ``levels``, from an initial guess. -> positions (N, 1, 2) px in ``b``, and which came back to ``return_px`` (N,)."""
+    start, flags = (np.zeros_like(points), 0) if guess is None else (guess.copy(), cv2.OPTFLOW_USE_INITIAL_FLOW)
+    more = None, None, (WINDOW_PX, WINDOW_PX), levels, CRITERIA, flags
+    ahead, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, points, start, *more)
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, ahead, points.copy(), *more)
+    closed = np.linalg.norm((back - points).reshape(-1, 2), axis=1) < return_px
+    return np.asarray(ahead), (ok.ravel() == 1) & (ok_back.ravel() == 1) & closed

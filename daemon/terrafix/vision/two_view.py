@@ -25,7 +25,8 @@ MIN_SPREAD = 0.12  # inliers must span this fraction of image width and height, 
 TWO_VIEW_MIN_INLIERS = 15  # by chance, 4 to 9 of 100 wrong matches agree
 TWO_VIEW_MIN_INLIER_RATIO = 0.15
 EPIPOLAR_PX = 1.5  # of a match from its epipolar line [spec: twice the 1-sigma of a feature, feature_tracker.py]
-MAX_MOTION_DRAWS = 3000  # of the search for a motion [spec: five of 30 % right matches are drawn in 99.9 %]
+MIN_MOTION_DRAWS, MAX_MOTION_DRAWS = 100, 3000  # [spec: five of 30 % right matches are drawn in 99.9 %]
+DRAWN = 0.999  # that probability
 # Share of the matches on epipolar lines that one homography explains over ground without relief: there the essential
 # matrix has a second solution, and the homography is the better model. [measured: docs/decisions/040]
 PLANAR_SHARE = 0.75
@@ -70,9 +71,10 @@ class TwoViewGeometry:
         if len(a) < TWO_VIEW_MIN_INLIERS:
             return TwoView(a[:0], b[:0], len(matches), a[:0], b[:0])
         x, y = self._camera.normalise(a), self._camera.normalise(b)
-        essential, mask = cv2.findEssentialMat(
-            x, y, np.eye(3), cv2.USAC_MAGSAC, 0.999, EPIPOLAR_PX / self._camera.fx, MAX_MOTION_DRAWS
-        )
+        fewest = min((TWO_VIEW_MIN_INLIERS / len(a)) ** 5, DRAWN)  # share of the draws, if no more matches are right
+        draws = int(np.clip(np.log1p(-DRAWN) / np.log1p(-fewest), MIN_MOTION_DRAWS, MAX_MOTION_DRAWS))
+        limit = EPIPOLAR_PX / self._camera.fx
+        essential, mask = cv2.findEssentialMat(x, y, np.eye(3), cv2.USAC_MAGSAC, DRAWN, limit, draws)
         on_lines = np.zeros(len(a), bool) if mask is None else mask.ravel() > 0
         if on_lines.sum() < TWO_VIEW_MIN_INLIERS:  # points on a plane are on epipolar lines, too
             return TwoView(a[:0], b[:0], len(matches), a[on_lines], b[on_lines])

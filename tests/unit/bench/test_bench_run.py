@@ -30,13 +30,9 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_missing_data_is_listed_in_the_result(measured: dict[str, Any]) -> None:
+def test_the_result_lists_missing_data_and_describes_the_machine(measured: dict[str, Any]) -> None:
     assert [text.split(":")[0] for text in measured["missing"]] == ["XFeat", "flight village-1", "flight town-a"]
     assert list(measured["flights"]) == ["generated"]
-
-
-@pytest.mark.slow
-def test_the_result_describes_the_machine(measured: dict[str, Any]) -> None:
     machine = measured["machine"]
     assert machine["cores"] >= 1 and machine["memory_mb"] > 100 and machine["cpu"]
     assert len(machine["load_average_before"]) == len(machine["load_average_after"]) == 3
@@ -76,17 +72,15 @@ def test_the_result_has_the_baseline_and_the_ratios_to_it(measured: dict[str, An
 
 
 @pytest.mark.slow
-def test_vision_and_anchor_have_a_floor_below_their_own_time(measured: dict[str, Any]) -> None:
+def test_vision_and_anchor_have_a_floor_below_their_own_time_and_single_parts_have_times(
+    measured: dict[str, Any],
+) -> None:
     floor = measured["flights"]["generated"]["floor"]
     for stage, kernel in (("vision", "KLT"), ("anchor", "Fourier transforms")):
         assert floor[stage]["ratio"] > 1.0
         assert 0.0 < floor[stage]["kernel_cpu_ms"]["median"] < floor[stage]["cpu_ms"]["median"]
         assert floor[stage]["kernels"][kernel]["calls"] >= 1.0
     assert floor["estimator"]["ratio"] is None
-
-
-@pytest.mark.slow
-def test_the_result_has_times_of_single_parts(measured: dict[str, Any]) -> None:
     micro = measured["micro"]
     assert micro["flight"] == "generated"
     for part in ("odometry", "look (search)", "belief update", "fix (patches + PnP)", "link, one second"):

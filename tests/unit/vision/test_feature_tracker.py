@@ -1,6 +1,7 @@
 """Frame-to-keyframe tracking: motion, foreign frames, lost overlap and new fragments."""
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.limits import WINDOW_NODES
 from terrafix.messages import Verdict
-from terrafix.vision import covisibility
+from terrafix.vision import covisibility, feature_tracker
 from terrafix.vision.feature_tracker import MAX_ODOMETRY_PAIRS, MAX_TRACK_FAILURES, FrameTracker, Motion
 from terrafix_lab.sim.true_messages import apply, homography
 from textured_ground import PINHOLE, rotation, texture, view
@@ -338,3 +339,20 @@ def test_a_weak_pair_of_large_photos_is_compared_in_detail(monkeypatch: pytest.M
             found.append(tracker.track(i, image))
     assert found[5].inliers > 1.3 * found[2].inliers >= 15
     assert is_right(found[5], first, second)
+
+
+def test_klt_tries_a_sample_of_the_corners_of_a_photo_and_follows_again_where_it_can(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried, flow = list[int](), feature_tracker.there_and_back
+
+    def tries(*given: Any) -> tuple[np.ndarray, np.ndarray]:
+        tried.append(len(given[2]))
+        ahead, came_back = flow(*given)
+        return ahead, came_back & (len(tried) > 3)
+
+    monkeypatch.setattr(feature_tracker, "there_and_back", tries)
+    tracker = FrameTracker(PINHOLE)
+    for i in range(5):
+        assert tracker.track(i, picture(ground, pose(2.0 * i, 0.0))).verdict is Verdict.ACCEPTED
+    assert tried[0] == tried[4] > 300 and tried[1:4] == [-(-tried[0] // 8)] * 3

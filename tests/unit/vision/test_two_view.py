@@ -1,5 +1,6 @@
 """Two views: which matches are on the ground, over relief, and which pairs of images determine no motion."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -137,3 +138,11 @@ def test_the_strongest_feature_is_the_first() -> None:
     features = SiftMatcher(10).describe(image.astype(np.uint8))
     assert len(features) >= 2
     assert np.allclose(features.xy_px[0], (40, 60), atol=1.0)
+
+
+def test_the_motion_of_a_few_matches_is_searched_for_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+    draws = list[int]()
+    monkeypatch.setattr(cv2, "findEssentialMat", lambda *a: (draws.append(a[-1]), (None, None))[1])
+    for count in (15, 30, 60):
+        TwoViewGeometry(CAMERA).fit(Matches(*np.random.default_rng(1).uniform(0.0, 400.0, (2, count, 2))))
+    assert draws == [100, 217, 3000]  # five of 15 right ones, in 99.9 %
