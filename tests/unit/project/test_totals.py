@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[3]
 CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
-LINES = {"daemon": 41046, "engines": 1740, "tools": 64301, "tests": 69143}
+LINES = {"daemon": 41092, "engines": 1742, "tools": 64627, "tests": 69143}
 WORDS = 65200  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
