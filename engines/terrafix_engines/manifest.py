@@ -235,7 +235,7 @@ def _used_tensors(manifest: Manifest) -> tuple[set[str], set[str]]:
     used_in: set[str] = {manifest.image.input} if manifest.image else set()
     used_out: set[str] = set()
     if manifest.role == "dense":
-        used_in, used_out = {*used_in, DENSE_INPUT}, set(DENSE_OUTPUTS)
+        used_in, used_out = {*used_in, DENSE_INPUT}, {DENSE_OUTPUTS[0]}
     if manifest.role == "correlation":
         used_in, used_out = set(CORRELATION_INPUTS), {CORRELATION_OUTPUT}
     if points := manifest.keypoints:

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View, without_colour
 from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.geodesy import LocalFrame, rot_w_b
 from terrafix.map.package import MapPackage
@@ -41,7 +40,7 @@ def likely_factor(shots: Iterable[Shot], origin: Origin, package: Path) -> str:
     """The factor or turn in words; empty where none stands out, or heading, height or start are not stated."""
     if not origin.start_sigma_m <= MAX_START_SIGMA_M:
         return ""
-    views = [view for shot in islice(shots, FRAMES) if (view := _view(shot, origin)) is not None]
+    views = [view for shot in islice(shots, FRAMES) if (view := reported_view(shot, origin)) is not None]
     opened = MapPackage.open(package)
     try:
         local = opened.bind(LocalFrame(origin.lat_deg, origin.lon_deg))
@@ -68,8 +67,8 @@ def likely_factor(shots: Iterable[Shot], origin: Origin, package: Path) -> str:
         opened.close()
 
 
-def _view(shot: Shot, origin: Origin) -> tuple[np.ndarray, View] | None:
-    """Grey image and reported camera of a frame over the start; None: something is not stated."""
+def reported_view(shot: Shot, origin: Origin) -> tuple[np.ndarray, View] | None:
+    """Image and reported camera of a frame over the start, without sigmas; None: something is not stated."""
     yaw_rad = next((s.yaw_rad for s in reversed(shot.states) if s.yaw_rad is not None), None)
     agl_m = next((s.agl_m for s in reversed(shot.states) if s.agl_m is not None), None)
     if shot.image is None or yaw_rad is None or agl_m is None or agl_m <= 0.0:
@@ -78,12 +77,12 @@ def _view(shot: Shot, origin: Origin) -> tuple[np.ndarray, View] | None:
     pitch_rad, roll_rad = (0.0, 0.0) if tilted is None else (tilted.pitch_rad or 0.0, tilted.roll_rad or 0.0)
     r_w_c = rot_w_b(yaw_rad, pitch_rad, roll_rad) @ Mount.of(origin.camera).r_b_c()
     view = View(0.0, 0.0, r_w_c, agl_m, origin.ground_amsl_m or 0.0, 0.0, 0.0, 0.0)
-    return cv2.cvtColor(shot.image, cv2.COLOR_BGR2GRAY), view
+    return shot.image, view
 
 
 def _score(matcher: FrameMatcher, grey: np.ndarray, view: View, window: _Window, hypothesis: Hypothesis) -> float:
     """Highest standardised correlation of a frame in the window; 0 where it cannot be correlated."""
-    found = matcher.correlate_as(grey, view, window, hypothesis)
+    found = matcher.correlate_as(without_colour(grey, matcher.gradients), view, window, hypothesis)
     return max((float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in found.surfaces), default=0.0)
 
 

@@ -17,22 +17,28 @@ NMS_SIDE_PX = 5
 
 
 class XFeatDescriber:
+    """Dense descriptors of XFeat, or of another model with its output: cells of the size that the manifest states."""
+
     name = "xfeat"
-    stride = STRIDE
-    channels = 64
     grayscale = False
 
     def __init__(self, model: Model, manifest: Manifest) -> None:
         """``model`` was opened with INPUTS and DESCRIPTORS_ONLY."""
         assert manifest.image is not None
         self.model, self._image = model, manifest.image
+        (output,) = manifest.tensors(DESCRIPTORS_ONLY)
+        _, channels, height, _ = output.shape
+        assert isinstance(channels, int)
+        self.channels, self.stride = channels, int(str(height).partition("/")[2])
+        if self.stride != STRIDE:
+            self.name = "own"
 
     def describe(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint8 BGR -> (64, H // 8, W // 8) float32, unit vectors. Raises ModelRunError."""
+        """(H, W, 3) uint8 BGR -> (channels, H // stride, W // stride) float32, unit vectors. Raises ModelRunError."""
         height, width = image.shape[:2]
         tensor = image_tensor(image, self._image, *self.model.side_lengths(height, width))
         (descriptors,) = self.model.run(tensor)
-        cells = descriptors[0][:, : height // STRIDE, : width // STRIDE]
+        cells = descriptors[0][:, : height // self.stride, : width // self.stride]
         norm = np.sqrt(np.einsum("khw,khw->hw", cells, cells))
         return (cells / np.maximum(norm, 1e-6)).astype(np.float32)
 

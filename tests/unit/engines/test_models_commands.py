@@ -105,7 +105,7 @@ def test_build_reports_its_result(
 
 def test_bench_compares_with_the_describer_without_weights(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "models.json"
-    bench_all([], str(folder), out, runs=3, pair=None, trials=1)
+    bench_all([], str(folder), out, runs=3)
     measured = json.loads(out.read_text())
     rows = measured["models"]["tiny"]["rows"]
     assert [row["sizes"]["height"] for row in rows] == [32, 64] and measured["machine"]["cores"] > 0
@@ -113,7 +113,7 @@ def test_bench_compares_with_the_describer_without_weights(folder: Path, tmp_pat
         assert row["provider"] == "CPU" and row["runs"] == 3 and row["baseline"]["what"] == "gradients"
         assert 0.0 < row["ms"]["median"] <= row["ms"]["p95"] and row["baseline"]["ms"]["median"] > 0.0
     with pytest.raises(OutputError, match="cannot be written"):
-        bench_all([], str(folder), out / "file.json", runs=1, pair=None, trials=1)
+        bench_all([], str(folder), out / "file.json", runs=1)
 
 
 def raster(path: Path, image: np.ndarray, x_m: float = 500_000.0, crs: int = 32633) -> Path:
@@ -121,32 +121,62 @@ def raster(path: Path, image: np.ndarray, x_m: float = 500_000.0, crs: int = 326
     return map_rasters.write_tif(path, image[:, :, ::-1].transpose(2, 0, 1), f"EPSG:{crs}", corner)
 
 
+SETS = """
+[[set]]
+name = "here"
+camera = "one.tif"
+map = "two.tif"
+agl_m = 60.0
+"""
+
+
 @pytest.mark.slow
-def test_bench_of_an_image_pair_shows_which_features_find_the_place(folder: Path, tmp_path: Path) -> None:
-    """The second image begins 30 px further east and is darker; positions are compared in ground coordinates."""
+def test_matching_places_frames_of_another_date_and_no_mirrored_ones(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The map begins 30 px further east and is darker; positions are compared in ground coordinates."""
+    from terrafix_tools.models.matching import measure_matching
     from textured_ground import texture
 
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     ground = np.ascontiguousarray(texture(6, 230.0)[:860, :900])
-    one = raster(tmp_path / "one.tif", ground)
-    two = raster(tmp_path / "two.tif", cv2.convertScaleAbs(ground[:, 30:], alpha=0.8), 500_000.0 + 30 * 0.5)
-    out = tmp_path / "models.json"
-    bench_all([], str(folder), out, runs=1, pair=(one, two), trials=1)
-    methods = json.loads(out.read_text())["pair"]["methods"]
-    assert set(methods) == {"SIFT", "gradients, dense", "tiny, dense", "tiny, nearest"}
-    assert methods["gradients, dense"]["near"] == 1.0 and methods["SIFT"]["near"] == 1.0
-    elsewhere = raster(tmp_path / "three.tif", ground, crs=32634)
+    raster(tmp_path / "one.tif", ground)
+    raster(tmp_path / "two.tif", cv2.convertScaleAbs(ground[:, 30:], alpha=0.8), 500_000.0 + 30 * 0.5)
+    (tmp_path / "sets.toml").write_text(SETS)
+
+    def rows_of(models: list[str]) -> dict[str, dict[str, Any]]:
+        out = tmp_path / "matching.json"
+        measure_matching(
+            tmp_path / "sets.toml",
+            tmp_path,
+            models,
+            str(folder),
+            only=["here"],
+            priors_m=[30.0],
+            unknown_heading=False,
+            places=2,
+            out=out,
+        )
+        return {row["method"]: row for row in json.loads(out.read_text())}
+
+    found = rows_of(["tiny"])
+    assert set(found) == {"gradients", "tiny", "gradients+tiny"}
+    gradients = found["gradients"]
+    assert gradients["placed"] == gradients["right"] == 1.0 and gradients["wrong"] == gradients["mirrored"] == 0
+    assert gradients["lead_nats"] > 2.0 and gradients["margin_sd"] > 2.0 and gradients["cpu_ms"] > 0.0
+    raster(tmp_path / "two.tif", ground, crs=32634)
     with pytest.raises(MapError, match="another coordinate system than"):
-        bench_all([], str(folder), out, runs=1, pair=(one, elsewhere), trials=1)
-    small = raster(tmp_path / "small.tif", ground[:500])
-    with pytest.raises(MapError, match="less than the 700 px of a window"):
-        bench_all([], str(folder), out, runs=1, pair=(one, small), trials=1)
+        rows_of([])
+    (tmp_path / "sets.toml").write_text("[[set]]\nname = 3\n")
+    with pytest.raises(MapError, match="no list of sets"):
+        rows_of([])
 
 
 def test_bench_times_a_model_of_fixed_input_size(tmp_path: Path) -> None:
     text = tiny_onnx.XFEAT_LIKE.split("[[presets]]")[0].replace('3, "height", "width"', "3, 24, 40")
     text = text.replace('"height/8", "width/8"', "3, 5")
     tiny_onnx.write(tmp_path, text, tiny_onnx.xfeat_like())
-    bench_all([], str(tmp_path), tmp_path / "m.json", runs=2, pair=None, trials=1)
+    bench_all([], str(tmp_path), tmp_path / "m.json", runs=2)
     (row,) = json.loads((tmp_path / "m.json").read_text())["models"]["tiny"]["rows"]
     assert row["input"] == [1, 3, 24, 40]
 

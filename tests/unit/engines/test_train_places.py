@@ -1,5 +1,6 @@
 """The list of training places: co-registration by georeference, held-out places. Needs no PyTorch."""
 
+import hashlib
 import subprocess
 import sys
 from pathlib import Path
@@ -10,8 +11,9 @@ import pytest
 from rasterio.transform import Affine
 
 import map_rasters
+from terrafix_lab.train import ground as ground_module
 from terrafix_lab.train.errors import TrainingError
-from terrafix_lab.train.ground import Place, read_list, read_places
+from terrafix_lab.train.ground import MIN_SIDE_PX, Place, inputs_of, read_list, read_places
 
 GSD_M = 0.5
 
@@ -41,14 +43,39 @@ def test_a_large_place_has_several_scale_levels(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), ground(1, 1400, 1300))
     levels = read_places([Place(name="here", pictures=["a.png"])], tmp_path)
     assert [level.pictures.shape for level in levels] == [(1, 3, 1400, 1300), (1, 3, 700, 650)]
+    assert levels[0].heights_px is None
+
+
+def test_a_generated_place_has_its_seasons_and_its_relief_at_every_scale(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ground_module, "GENERATED_M", 400.0)
+    fine, coarse = read_places([Place(name="here", generated=7)], Path())
+    assert fine.pictures.shape == (4, 3, 800, 800) and coarse.pictures.shape == (4, 3, 400, 400)
+    assert fine.heights_px is not None and coarse.heights_px is not None
+    assert abs(float(fine.heights_px.mean())) < 2.0 < float(np.ptp(fine.heights_px))
+    assert np.ptp(coarse.heights_px) == pytest.approx(0.5 * np.ptp(fine.heights_px), rel=0.1)
+    assert len({picture.tobytes() for picture in fine.pictures}) == 4
+
+
+def test_every_input_is_listed_with_its_licence_and_checksum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ground_module, "GENERATED_M", 200.0)
+    (tmp_path / "a.tif").write_bytes(b"image")
+    places = [Place(name="a", pictures=["a.tif"], licence="CC0"), Place(name="b", generated=7, held_out=True)]
+    image, generated = inputs_of(places, tmp_path)
+    assert image == {
+        "name": "a.tif",
+        "use": "trained on",
+        "licence": "CC0",
+        "sha256": hashlib.sha256(b"image").hexdigest(),
+    }
+    assert generated["use"] == "held out" and len(generated["sha256"]) == 64
 
 
 @pytest.mark.parametrize(
     "second, reason",
     [
         ({"west_m": 1000.0, "gsd_m": 0.6}, "another size"),
-        ({"west_m": 1000.0 + 500 * GSD_M}, "less than 640 px"),
-        ({"west_m": 90_000.0}, "less than 640 px"),
+        ({"west_m": 1000.0 + 600 * GSD_M}, f"less than {MIN_SIDE_PX} px"),
+        ({"west_m": 90_000.0}, f"less than {MIN_SIDE_PX} px"),
     ],
 )
 def test_dates_with_mismatching_grids_are_rejected(tmp_path: Path, second: dict[str, float], reason: str) -> None:
@@ -67,7 +94,7 @@ def test_images_without_georeference_must_have_one_size(tmp_path: Path) -> None:
 
 def listed(*places: tuple[str, str, bool]) -> str:
     return "".join(
-        f'[[place]]\nname = "{name}"\npictures = ["{picture}"]\nheld_out = {str(held_out).lower()}\n'
+        f'[[place]]\nname = "{name}"\nlicence = "mine"\npictures = ["{picture}"]\nheld_out = {str(held_out).lower()}\n'
         for name, picture, held_out in places
     )
 
@@ -80,6 +107,8 @@ def listed(*places: tuple[str, str, bool]) -> str:
         (listed(("a", "a.tif", False), ("a", "b.tif", True)), "one name"),
         (listed(("a", "a.tif", False), ("b", "a.tif", True)), "a.tif is trained on and held out"),
         ("[[place]]\nname = 'a'\n", "pictures"),
+        ("[[place]]\nname = 'a'\npictures = ['a.tif']\n", "a states no licence"),
+        ("[[place]]\nname = 'a'\npictures = ['a.tif']\ngenerated = 3\n", "state one"),
         ("[place", "no list of places"),
     ],
 )

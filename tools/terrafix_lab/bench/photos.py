@@ -26,7 +26,7 @@ from terrafix_lab.bench import flights
 from terrafix_lab.sim.world import place as world
 from terrafix_tools.mapping.build import build
 from terrafix_tools.mapping.source import ImagerySource
-from terrafix_tools.models.pair import same_grid
+from terrafix_tools.models.two_dates import same_grid
 
 SIZE_PX = 6252, 4168  # 26 megapixels, 3 : 2
 FOCAL = 1 / (2 * math.tan(math.radians(30.0)))  # focal length / image width: 60 degrees field of view

@@ -1,7 +1,8 @@
-"""From images to weights: python -m terrafix_lab.train PLACES.toml --folder DATA --out OUT [--minutes 9]
+"""From images to weights: python -m terrafix_lab.train PLACES.toml --folder DATA --out OUT [--minutes 60]
 
 The same command resumes an interrupted run. OUT then contains NAME.onnx with its manifest NAME.toml, log.csv, and the
-checkpoint. The evaluation on held-out places is a first check; docs/training.md describes how to assess the weights."""
+checkpoint. The evaluation on held-out places stops the training; docs/training.md describes how to judge the
+weights."""
 
 import argparse
 import sys
@@ -16,12 +17,9 @@ except ModuleNotFoundError:
 
 from terrafix_lab.train.errors import TrainingError
 from terrafix_lab.train.export import ManifestText, export
-from terrafix_lab.train.ground import read_list, read_places
+from terrafix_lab.train.ground import inputs_of, read_list, read_places
 from terrafix_lab.train.loop import Progress, Recipe, Training
-from terrafix_lab.train.losses import WEIGHTS
 from terrafix_lab.train.views import ImageStack, to_device
-
-UNSTATED = "not stated; the licences of the training images apply"
 
 
 def main() -> None:
@@ -54,27 +52,25 @@ def train(args: argparse.Namespace) -> None:
             typer.echo(line(progress, recipe.steps))
             log.write(row(progress))
     text_fields = ManifestText(
-        args.name, args.licence, f"trained on {', '.join(recipe.trained_on)}; step {training.step}"
+        args.name, f"trained on {', '.join(recipe.trained_on)}; step {training.step}", inputs_of(places, args.folder)
     )
-    path = export(training.network, args.out, text_fields)
-    typer.echo(f"written to {path}, with its manifest; assess it: docs/training.md")
-    if training.step < recipe.steps:
+    path = export(training.best_network(), args.out, text_fields)
+    typer.echo(f"written to {path}, with its manifest; judge it: docs/training.md")
+    if not training.is_over:
         typer.echo(f"{recipe.steps - training.step} of {recipe.steps} steps are left: the same command resumes")
 
 
 def line(progress: Progress, steps: int) -> str:
-    losses = "  ".join(f"{name} {value:.2f}" for name, value in progress.losses.items())
-    pace = f"  {progress.steps_per_s:.1f} steps/s" if progress.steps_per_s else ""
-    return f"{progress.step}/{steps}  {losses}{pace}" + (f"  {progress.evaluation}" if progress.evaluation else "")
+    pace = f"  {progress.steps_per_s:.2f} steps/s" if progress.steps_per_s else ""
+    found = f"  {progress.evaluation}" if progress.evaluation else ""
+    return f"{progress.step}/{steps}  {progress.nats:.3f} nats{pace}{found}"
 
 
 def row(progress: Progress) -> str:
-    """A row of log.csv: step, the losses in the order of WEIGHTS, places found, tiles found."""
-    numbers = [f"{progress.losses.get(name, float('nan')):.4f}" for name in WEIGHTS]
-    held_out = (
-        [f"{progress.evaluation.found:.4f}", f"{progress.evaluation.tiles:.4f}"] if progress.evaluation else ["", ""]
-    )
-    return ",".join([str(progress.step), *numbers, *held_out]) + "\n"
+    """A row of log.csv: step, loss; of the held-out places loss, share that leads, margin."""
+    found = progress.evaluation
+    held_out = [f"{found.nats:.4f}", f"{found.leads:.4f}", f"{found.margin:.4f}"] if found else ["", "", ""]
+    return ",".join([str(progress.step), f"{progress.nats:.4f}", *held_out]) + "\n"
 
 
 def arguments() -> argparse.Namespace:
@@ -83,11 +79,10 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--folder", type=Path, default=Path(), help="base of the image paths")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--name", default="ours", help="of the model: lower case, digits, . - _")
-    parser.add_argument("--licence", default=UNSTATED)
     parser.add_argument("--minutes", type=float, default=1e6, help="stop after this time; the same command resumes")
     parser.add_argument("--steps", type=int, default=20_000, help="of the whole training, over all runs")
-    parser.add_argument("--batch", type=int, default=32, help="pairs of views a step")
-    parser.add_argument("--width", type=int, default=64, help="channels at an eighth of the image resolution")
+    parser.add_argument("--batch", type=int, default=8, help="pairs of views a step")
+    parser.add_argument("--width", type=int, default=32, help="channels at a quarter of the image resolution")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--device", default="", help="cuda or cpu; default: cuda if available")
     return parser.parse_args()

@@ -10,9 +10,9 @@ import torch
 from terrafix_engines.manifest import ManifestError, read
 from terrafix_engines.runtime import Model, ModelFileError
 from terrafix_lab.train.errors import TrainingError
-from terrafix_lab.train.network import CHANNELS, STRIDE, TILE_CHANNELS, FeatureNetwork
+from terrafix_lab.train.network import CHANNELS, STRIDE, FeatureNetwork
 
-INPUT, OUTPUTS = "input", ("descriptors", "keypoint_logits", "reliability", "tile")
+INPUT, OUTPUTS = "input", ("descriptors",)
 OPSET = 18
 MULTIPLE = 32  # of the image sides; twice the network's stride, matches the GPU presets
 SIDES = (320, 640, 960, 1280)  # px: a map tile with its margin; rectified frames by field of view and heading
@@ -21,11 +21,15 @@ TRACED_SIDES = (96, 64)  # px; arbitrary, but must differ
 
 @dataclass(frozen=True)
 class ManifestText:
-    """Descriptive text fields of the manifest."""
+    """Descriptive fields of the manifest. ``inputs``: name, use, licence and sha256 of everything it was made from."""
 
     name: str
-    licence: str
     credit: str
+    inputs: list[dict[str, str]]
+
+    @property
+    def licence(self) -> str:
+        return "; ".join(sorted({one["licence"] for one in self.inputs}))
 
 
 def export(network: FeatureNetwork, folder: Path, text_fields: ManifestText) -> Path:
@@ -56,17 +60,13 @@ def export(network: FeatureNetwork, folder: Path, text_fields: ManifestText) -> 
 
 
 def manifest(text_fields: ManifestText, file: str, content: bytes) -> str:
-    """The manifest as TOML."""
-    shapes = {
-        "descriptors": f'["batch", {CHANNELS}, "height/{STRIDE}", "width/{STRIDE}"]',
-        "keypoint_logits": f'["batch", {STRIDE**2 + 1}, "height/{STRIDE}", "width/{STRIDE}"]',
-        "reliability": f'["batch", 1, "height/{STRIDE}", "width/{STRIDE}"]',
-        "tile": f'["batch", {TILE_CHANNELS}]',
-    }
-    outputs = "".join(f'\n[[outputs]]\nname = "{name}"\nshape = {shapes[name]}\n' for name in OUTPUTS)
+    """The manifest as TOML; the inputs of the training are comments, which nobody else needs to read."""
     presets = "".join(f"\n[[presets]]\nsizes = {{ batch = 1, height = {side}, width = {side} }}\n" for side in SIDES)
-    return f"""name = {_quoted(text_fields.name)}
-title = "trained by terrafix_lab.train: dense descriptors, keypoints, reliability, a descriptor of the tile"
+    made_from = "".join(
+        f"# {one['use']}: {one['name']}, sha256 {one['sha256']}, {one['licence']}\n" for one in text_fields.inputs
+    )
+    return f"""{made_from}name = {_quoted(text_fields.name)}
+title = "trained by terrafix_lab.train: dense descriptors of cells of {STRIDE} px"
 role = "dense"
 file = {_quoted(file)}
 sha256 = "{hashlib.sha256(content).hexdigest()}"
@@ -82,7 +82,11 @@ multiple = {MULTIPLE}
 [[inputs]]
 name = "{INPUT}"
 shape = ["batch", 3, "height", "width"]
-{outputs}{presets}"""
+
+[[outputs]]
+name = "{OUTPUTS[0]}"
+shape = ["batch", {CHANNELS}, "height/{STRIDE}", "width/{STRIDE}"]
+{presets}"""
 
 
 def _quoted(text: str) -> str:

@@ -1,8 +1,9 @@
-"""Training loop: samples views, augments them, takes optimiser steps, saves checkpoints.
+"""Training loop: samples views, augments them, takes optimiser steps, saves checkpoints, keeps the best weights.
 
 The views and augmentations of a step depend on the seed and the step number only, so a resumed run continues with the
 same data. On a CPU the result is bit-identical; a GPU sums gradients in varying order."""
 
+import copy
 import math
 import time
 from collections.abc import Iterator
@@ -14,16 +15,18 @@ import numpy as np
 import torch
 
 from terrafix_lab.train.errors import TrainingError
-from terrafix_lab.train.losses import WEIGHTS, TrainingLoss
+from terrafix_lab.train.losses import TrainingLoss
 from terrafix_lab.train.measure import Evaluation, evaluate
 from terrafix_lab.train.network import FeatureNetwork
 from terrafix_lab.train.views import ImageStack, Views, sample_views
 from terrafix_lab.train.weather import augment
 
-LEARNING_RATE, WARM_UP_SHARE, WEIGHT_DECAY, MAX_GRADIENT_NORM = 1e-3, 0.05, 1e-2, 1.0
-CHECKPOINT_EVERY_S, REPORT_EVERY_S = 60.0, 10.0
-EVALUATION_EVERY = 20  # progress reports per evaluation
-LOSS_SMOOTHING = 0.95  # exponential smoothing of the reported losses
+LEARNING_RATE, WARM_UP_SHARE, WEIGHT_DECAY, MAX_GRADIENT_NORM = 2e-3, 0.05, 1e-2, 1.0
+CHECKPOINT_EVERY_S = 60.0
+REPORT_EVERY, EVALUATION_EVERY = 25, 250  # steps
+EVALUATION_VIEWS = 96
+PATIENCE = 8  # evaluations without a better one after which the training stops
+LOSS_SMOOTHING = 0.98  # exponential smoothing of the reported loss
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Recipe:
 @dataclass(frozen=True)
 class Progress:
     step: int
-    losses: dict[str, float]
+    nats: float
     steps_per_s: float
     evaluation: Evaluation | None
 
@@ -57,33 +60,49 @@ class Training:
         self.network, self._criterion = FeatureNetwork(recipe.width).to(device), TrainingLoss().to(device)
         self._all = [*self.network.parameters(), *self._criterion.parameters()]
         self._optimiser = torch.optim.AdamW(self._all, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+        self._best_nats, self._best_step = math.inf, 0
+        self._best = copy.deepcopy(self.network.state_dict())
         if checkpoint.exists():
             self._load()
 
-    def run(self, seconds: float) -> Iterator[Progress]:
-        """Trains for ``seconds`` or until all steps are done; yields progress reports."""
-        start_s = report_s = checkpoint_s = time.monotonic()
-        smoothed: dict[str, float] = {}
-        reports, report_step, start_step = 0, self.step, self.step
-        self.network.train()
-        while self.step < self.recipe.steps and time.monotonic() - start_s < seconds:
-            for name, value in self._train_step().items():
-                smoothed[name] = LOSS_SMOOTHING * smoothed.get(name, value) + (1 - LOSS_SMOOTHING) * value
-            now_s = time.monotonic()
-            if now_s - report_s >= REPORT_EVERY_S or self.step == start_step + 1:
-                pace = (self.step - report_step) / max(now_s - report_s, 1e-6)
-                yield Progress(
-                    self.step, dict(smoothed), pace, self.evaluate() if reports % EVALUATION_EVERY == 0 else None
-                )
-                reports, report_step, report_s = reports + 1, self.step, time.monotonic()
-            if now_s - checkpoint_s >= CHECKPOINT_EVERY_S:
-                self.save_checkpoint()
-                checkpoint_s = now_s
-        self.save_checkpoint()
-        yield Progress(self.step, smoothed, 0.0, self.evaluate(batches=8))
+    @property
+    def is_over(self) -> bool:
+        """Whether all steps are done, or PATIENCE evaluations brought nothing better."""
+        return self.step >= self.recipe.steps or self.step - self._best_step >= PATIENCE * EVALUATION_EVERY
 
-    def evaluate(self, batches: int = 2) -> Evaluation:
-        return evaluate(self.network, self._held_out, batches, self.recipe.batch)
+    def best_network(self) -> FeatureNetwork:
+        """The weights that were best on the held-out places."""
+        network = FeatureNetwork(self.recipe.width)
+        network.load_state_dict(self._best)
+        return network
+
+    def run(self, seconds: float) -> Iterator[Progress]:
+        """Trains for ``seconds`` or until it is over; yields progress reports."""
+        start_s = report_s = checkpoint_s = time.monotonic()
+        smoothed: float | None = None
+        self.network.train()
+        while not self.is_over and time.monotonic() - start_s < seconds:
+            nats = self._train_step()
+            smoothed = nats if smoothed is None else LOSS_SMOOTHING * smoothed + (1 - LOSS_SMOOTHING) * nats
+            if self.step % REPORT_EVERY == 0:
+                pace = REPORT_EVERY / max(time.monotonic() - report_s, 1e-6)
+                yield Progress(self.step, smoothed, pace, self._judge() if self.step % EVALUATION_EVERY == 0 else None)
+                report_s = time.monotonic()
+            if time.monotonic() - checkpoint_s >= CHECKPOINT_EVERY_S:
+                self.save_checkpoint()
+                checkpoint_s = time.monotonic()
+        evaluation = self._judge()
+        self.save_checkpoint()
+        yield Progress(self.step, smoothed or 0.0, 0.0, evaluation)
+
+    def _judge(self) -> Evaluation:
+        """Evaluates, and keeps the weights if they are the best."""
+        batches = max(EVALUATION_VIEWS // self.recipe.batch, 1)
+        found = evaluate(self.network, self._criterion, self._held_out, batches, self.recipe.batch)
+        if found.nats < self._best_nats:
+            self._best_nats, self._best_step = found.nats, self.step
+            self._best = copy.deepcopy(self.network.state_dict())
+        return found
 
     def save_checkpoint(self) -> None:
         """Writes the checkpoint atomically, because a truncated one could not be resumed."""
@@ -95,6 +114,7 @@ class Training:
                 "network": self.network.state_dict(),
                 "teacher": self._criterion.state_dict(),
                 "optimiser": self._optimiser.state_dict(),
+                "best": (self._best_nats, self._best_step, self._best),
             },
             part,
         )
@@ -110,25 +130,27 @@ class Training:
         self._criterion.load_state_dict(saved["teacher"])
         self._optimiser.load_state_dict(saved["optimiser"])
         self.step = saved["step"]
+        self._best_nats, self._best_step, self._best = saved["best"]
 
-    def _train_step(self) -> dict[str, float]:
+    def _train_step(self) -> float:
         rng = np.random.default_rng((self.recipe.seed, self.step))
         g = torch.Generator(self.device).manual_seed(self.recipe.seed * 1_000_003 + self.step)
         for group in self._optimiser.param_groups:
             group["lr"] = LEARNING_RATE * learning_rate_factor(self.step, self.recipe.steps)
         with torch.no_grad():
             views = augment_views(sample_views(self._trained, self.recipe.batch, rng), g)
-        losses = self._criterion.losses(self.network, views, g)
-        total = torch.stack([WEIGHTS[name] * loss for name, loss in losses.items()]).sum()
+        loss, _ = self._criterion(self.network, views)
         self._optimiser.zero_grad()
-        total.backward()
+        loss.backward()
         torch.nn.utils.clip_grad_norm_(self._all, MAX_GRADIENT_NORM)
         self._optimiser.step()
         self.step += 1
-        values = torch.stack([loss.detach() for loss in losses.values()]).tolist()
-        if not all(math.isfinite(value) for value in values):
-            raise TrainingError(f"step {self.step}: a loss is not a number; the last checkpoint is {self._checkpoint}")
-        return dict(zip(losses, values, strict=True))
+        nats = float(loss.detach())
+        if not math.isfinite(nats):
+            raise TrainingError(
+                f"step {self.step}: the loss is not a number; the last checkpoint is {self._checkpoint}"
+            )
+        return nats
 
 
 def augment_views(views: Views, g: torch.Generator) -> Views:

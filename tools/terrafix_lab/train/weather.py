@@ -20,9 +20,11 @@ JPEG_STEPS = (10.0, 8.0)  # step at the lowest frequency, and its increase per r
 
 def augment(view: Tensor, g: Generator) -> Tensor:
     """Applies all changes in physical order: ground, illumination, lens, sensor, file."""
+    view = view.clone()
     for change, share in CHANGES:
-        hit = (_uniform(view, g, 0.0, 1.0) < share).to(view.dtype)
-        view = torch.lerp(view, change(view, g).clamp(0.0, 1.0), hit)
+        hit = torch.nonzero(_uniform(view, g, 0.0, 1.0).flatten() < share)[:, 0]
+        if len(hit):
+            view[hit] = change(view[hit], g).clamp(0.0, 1.0)
     return view
 
 

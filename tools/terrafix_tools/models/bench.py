@@ -31,10 +31,8 @@ MAX_TIME_S = 20.0  # time limit per input size: a slow model gets fewer runs
 MIN_RUNS = 3
 
 
-def bench_all(
-    names: list[str], folder: str, out: Path, *, runs: int, pair: tuple[Path, Path] | None, trials: int
-) -> None:
-    """Prints tables, writes ``out``. Raises ModelError, OutputError, and MapError for the pair."""
+def bench_all(names: list[str], folder: str, out: Path, *, runs: int) -> None:
+    """Prints a table, writes ``out``. Raises ModelError, OutputError."""
     models = fetched_models(names, folder)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -46,12 +44,6 @@ def bench_all(
         for model in models:
             result["models"][model.manifest.name] = _measure(model, runs)
         _show(result["models"])
-        if pair:
-            # needs rasterio, which a vehicle does not have
-            from terrafix_tools.models.pair import measure_pair, show_pair
-
-            result["pair"] = measure_pair(models, *pair, trials)
-            show_pair(result["pair"])
     out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     typer.echo(f"written to {out}")
 

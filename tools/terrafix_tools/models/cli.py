@@ -1,5 +1,6 @@
 """The commands `terrafix models ...`."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -70,15 +71,40 @@ def bench(
     folder: Folder = "",
     out: Annotated[Path, typer.Option(help="JSON to write.")] = Path("out/models.json"),
     runs: Annotated[int, typer.Option(min=1, help="Timed runs per input size.")] = 20,
-    pair: Annotated[
-        tuple[Path, Path] | None,
-        typer.Option(
-            help="Two images of one place at two dates: measures how often a patch of the first is found in the second."
-        ),
-    ] = None,
-    trials: Annotated[int, typer.Option(min=1, help="Number of patches tried on the pair.")] = 40,
 ) -> None:
-    """Measure run times of models next to a baseline without weights; with --pair also the localisation rate."""
+    """Measure run times of models next to a baseline without weights."""
     from terrafix_tools.models.bench import bench_all
 
-    bench_all(names or [], folder, out, runs=runs, pair=pair, trials=trials)
+    bench_all(names or [], folder, out, runs=runs)
+
+
+@app.command()
+def matching(
+    sets: Annotated[
+        Path, typer.Argument(help="TOML list of pairs of dates and flights, as config/training/judges.toml.")
+    ],
+    names: Annotated[list[str] | None, typer.Option("--model", help="Model to compare; repeatable.")] = None,
+    folder: Folder = "",
+    data: Annotated[Path, typer.Option(help="Folder that the paths of the list are relative to.")] = Path(),
+    only: Annotated[list[str] | None, typer.Option("--set", help="Name of a set; repeatable. Default: all.")] = None,
+    prior: Annotated[
+        list[float] | None, typer.Option(help="1-sigma of the known position, m; repeatable; inf: whole map.")
+    ] = None,
+    unknown_heading: Annotated[bool, typer.Option(help="Also without a heading.")] = True,
+    places: Annotated[int, typer.Option(min=2, help="Frames of each set.")] = 40,
+    out: Annotated[Path, typer.Option(help="JSON to write.")] = Path("out/matching.json"),
+) -> None:
+    """Measure how often single frames are placed on a map of another date: gradients and models side by side."""
+    from terrafix_tools.models.matching import measure_matching
+
+    measure_matching(
+        sets,
+        data,
+        names or [],
+        folder,
+        only=only or [],
+        priors_m=prior or [100.0, 300.0, 1000.0, math.inf],
+        unknown_heading=unknown_heading,
+        places=places,
+        out=out,
+    )

@@ -50,7 +50,7 @@ class MapFeatures:
     ) -> None:
         """``store``: file store in which tiles outlive this process."""
         self._source = source
-        self._describer = describer
+        self.describer = describer
         self._pad_px = pad_px
         self._store = store
         self._tiles: OrderedDict[tuple[float, int, int], tuple[np.ndarray, np.ndarray]] = OrderedDict()
@@ -65,8 +65,8 @@ class MapFeatures:
         -> descriptors (C, height, width) float32, valid (height, width) bool, and the corner used: the nearest one on
         the grid of cells.
         """
-        cell = gsd_m * self._describer.stride
-        per_tile = TILE_CELLS_PX // self._describer.stride
+        cell = gsd_m * self.describer.stride
+        per_tile = TILE_CELLS_PX // self.describer.stride
         column, row = round(e_min_m / cell), round(-n_max_m / cell)
         valid = np.empty((height, width), bool)  # the tiles cover all of it
         out: np.ndarray | None = None
@@ -87,7 +87,7 @@ class MapFeatures:
 
     def _tile(self, gsd_m: float, tx: int, ty: int, cell: float, per_tile: int) -> tuple[np.ndarray, np.ndarray]:
         key = (gsd_m, tx, ty)
-        name = f"{self._describer.name} {gsd_m!r} {tx} {ty}"
+        name = f"{self.describer.name} {gsd_m!r} {tx} {ty}"
         if key in self._tiles:
             self._tiles.move_to_end(key)
             if self._store is not None:
@@ -106,7 +106,7 @@ class MapFeatures:
         return tile
 
     def _computed(self, gsd_m: float, tx: int, ty: int, cell: float, per_tile: int) -> tuple[np.ndarray, np.ndarray]:
-        stride, pad_px = self._describer.stride, self._pad_px
+        stride, pad_px = self.describer.stride, self._pad_px
         side = TILE_CELLS_PX + 2 * pad_px
         image, ok = self._source.window(
             tx * per_tile * cell - pad_px * gsd_m, -ty * per_tile * cell + pad_px * gsd_m, side, side, gsd_m
@@ -115,9 +115,9 @@ class MapFeatures:
         rim = slice(pad_px, pad_px + TILE_CELLS_PX)
         valid = np.asarray(ok[rim, rim].reshape(per_tile, stride, per_tile, stride).all(axis=(1, 3)))
         if valid.any():
-            descriptors = self._describer.describe(image)[:, inner, inner]
+            descriptors = self.describer.describe(image)[:, inner, inner]
             return np.where(valid, descriptors, 0.0).astype(np.float16), valid
-        return np.zeros((self._describer.channels, *valid.shape), np.float16), valid  # no map data in this tile
+        return np.zeros((self.describer.channels, *valid.shape), np.float16), valid  # no map data in this tile
 
 
 def put_widened(half: np.ndarray, to: np.ndarray) -> None:

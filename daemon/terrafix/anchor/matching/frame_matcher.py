@@ -33,16 +33,20 @@ from terrafix.map.package import LocalMap
 from terrafix.messages import PnpInput, Verdict
 from terrafix_engines.correlation import GraphCorrelator
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_engines.retrieval.pooled import PooledDescriber
 
 # Ground sampling distance of the correlation as a share of the height: coarse enough for speed and for tolerance to
 # small changes, fine enough for houses and kerbs. [tuned]
 CORRELATION_GSD_PER_AGL = 1 / 100
 # ground sampling distance of the patches as a share of the height [tuned]
-FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330}
+FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330, "own": 1 / 170}
 GSD_STEPS_PER_OCTAVE = 2  # Scales are rounded to this grid, so that the map's descriptors can be cached [tuned]
 # Side of a correlation window; a wider one is correlated on coarser cells, which bounds the cost of a look with a wide
 # belief. [measured: docs/decisions/047-cells-of-a-look.md]
 MAX_WINDOW_CELLS = 640
+# Largest side of a cell of means, pixels: twice as many divide a tile of the map and its rim
+# [spec: descriptor_cache.TILE_PAD_PX]
+MAX_STRIDE = 16
 # Hypotheses of yaw and scale of one look. Of more, cells twice as large select as many: between two of them the border
 # of a frame is several cells from its place anyway. [measured: docs/decisions/047-cells-of-a-look.md]
 MAX_FINE_HYPOTHESES = 9
@@ -190,6 +194,8 @@ class FrameMatcher:
         self._describer = describer
         self._subset = 0
         self._features = MapFeatures(source, describer, cache_bytes, store=store)
+        self._by_pool: dict[tuple[str, int], MapFeatures] = {}
+        self._cache_bytes, self._store = cache_bytes, store
         # Correlation is always on gradients: on learned descriptors it finds no more frames at twice the processor
         # time of a flight and more (docs/models.md). The model describes patches where those of gradients give no pose.
         self.gradients = describer if describer.stride == 1 else GradientDescriber()
@@ -238,41 +244,64 @@ class FrameMatcher:
         """
         hypotheses = self._next_subset(_hypotheses(view))
         image = without_colour(image, self.gradients)
-        cell = self.correlation_cell_m(view.agl_m)
-        while 2 * belief.half_m / cell > MAX_WINDOW_CELLS:
-            cell *= 2.0
-        # Of a drawn map, which says little, every hypothesis counts: the belief itself searches it.
-        if len(hypotheses) > MAX_FINE_HYPOTHESES and not self._drawn:
-            coarse = self._correlated(image, view, belief, hypotheses, 2.0 * cell)
+        gsd, pool = _bounded(self.correlation_cell_m(view.agl_m), 1, belief)
+        # Of a drawn map, which says little, every hypothesis counts: the belief itself searches it. Its lines are as
+        # clear on larger pixels.
+        if self._drawn:
+            return self._correlated(image, view, belief, hypotheses, gsd * pool)
+        if len(hypotheses) > MAX_FINE_HYPOTHESES:
+            coarse = self._correlated(image, view, belief, hypotheses, gsd, 2 * pool)
             if coarse.verdict is Verdict.ACCEPTED:
                 hypotheses = coarse.best_hypotheses(MAX_FINE_HYPOTHESES)
-        return self._correlated(image, view, belief, hypotheses, cell)
+        return self._correlated(image, view, belief, hypotheses, gsd, pool)
 
     def correlate_as(self, grey: Image, view: View, belief: SearchWindow, hypothesis: Hypothesis) -> CorrelationResult:
         """``correlate`` of a grey image with one hypothesis of yaw and height, of any size."""
         turned = view_at(view, hypothesis, view.e_m, view.n_m)
         return self._correlated(grey, turned, belief, (AS_PREDICTED,), self.correlation_cell_m(turned.agl_m))
 
+    def correlate_learned(self, image: Image, view: View, belief: SearchWindow) -> CorrelationResult:
+        """``correlate`` on the descriptors of the learned model."""
+        gsd, pool = _bounded(
+            self.cell_m(view.agl_m, FIX_GSD_PER_AGL[self._describer.name]), self._describer.stride, belief
+        )
+        return self._correlated(image, view, belief, _hypotheses(view), gsd, pool, self._describer)
+
     def _correlated(
-        self, image: Image, view: View, belief: SearchWindow, hypotheses: tuple[Hypothesis, ...], cell: float
+        self,
+        image: Image,
+        view: View,
+        belief: SearchWindow,
+        hypotheses: tuple[Hypothesis, ...],
+        gsd: float,
+        pool: int = 1,
+        learned: Describer | None = None,
     ) -> CorrelationResult:
-        """``image``: grey where that is enough; ``cell``: metres."""
-        first = rectify(image, self.camera, view.r_w_c, view.agl_m, cell, 1)
-        if first is None or min(first.mask.shape) < MIN_SIDE_CELLS / 2:
+        """``image``: grey where that is enough; ``gsd``: metres, of the pixels that are described; ``pool``: cells of
+        the describer in a side of those that are correlated; ``learned``: describer instead of the gradients."""
+        features = self._pooled(learned or self.gradients, pool)
+        describer = features.describer
+        cell = gsd * describer.stride
+        first = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, describer.stride)
+        if first is None or min(first.mask.shape) < describer.stride * MIN_SIDE_CELLS / 2:
             return CorrelationResult(Verdict.TOO_LOW)
-        footprint_m = float(np.sqrt(first.mask.sum())) * cell
-        frames = [first] if hypotheses == (AS_PREDICTED,) else self.rectify_all(image, view, hypotheses, cell, 1)
+        footprint_m = float(np.sqrt(first.mask.sum())) * gsd
+        frames = (
+            [first]
+            if hypotheses == (AS_PREDICTED,)
+            else self.rectify_all(image, view, hypotheses, gsd, describer.stride)
+        )
         usable = [(h, f) for h, f in zip(hypotheses, frames, strict=True) if f is not None]
         extents = [self._extent(f) for _, f in usable]
         e_min = belief.centre[0] - belief.half_m + min(r[0] for r in extents)
         n_max = belief.centre[1] + belief.half_m + max(r[1] for r in extents)
         width = int((2 * belief.half_m + max(r[2] for r in extents) - min(r[0] for r in extents)) / cell) + 2
         height = int((2 * belief.half_m + max(r[1] for r in extents) - min(r[3] for r in extents)) / cell) + 2
-        descriptors, valid, e_min, n_max = self.gradient_features.window(e_min, n_max, width, height, cell)
+        descriptors, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
         if not valid.any():
             return CorrelationResult(Verdict.OUTSIDE_MAP)
         window = CorrelationWindow(descriptors, valid, self._drawn, self._correlator)
-        correlations = window.correlate_all([_describe(frame, self.gradients) for _, frame in usable])
+        correlations = window.correlate_all([_describe(frame, describer) for _, frame in usable])
         surfaces = []
         for (_, frame), correlation in zip(usable, correlations, strict=True):
             z = standardise(correlation)
@@ -355,6 +384,16 @@ class FrameMatcher:
         )
         return PatchFix(xy, points, found.weight, solve(points, xy, found.weight, given), cell, given)
 
+    def _pooled(self, describer: Describer, pool: int) -> MapFeatures:
+        """The map's descriptors, averaged over squares of ``pool`` cells."""
+        if pool == 1:
+            return self.gradient_features if describer is self.gradients else self._features
+        key = describer.name, pool
+        if key not in self._by_pool:
+            mean = PooledDescriber(describer, pool)
+            self._by_pool[key] = MapFeatures(self._map, mean, self._cache_bytes, store=self._store)
+        return self._by_pool[key]
+
     def _next_subset(self, hypotheses: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
         """Subset of the hypotheses that one frame can afford: some of the scales, beginning with the predicted one; the
         next frames take the others. A scale that does not fit gives no evidence on any position, so the belief keeps
@@ -370,6 +409,14 @@ class FrameMatcher:
         """Extent of a rectified frame relative to the nadir, metres: e_min, n_max, e_max, n_min."""
         h, w = frame.mask.shape
         return (frame.e_min_m, frame.n_max_m, frame.e_min_m + w * frame.gsd_m, frame.n_max_m - h * frame.gsd_m)
+
+
+def _bounded(gsd: float, stride: int, belief: SearchWindow) -> tuple[float, int]:
+    """Pixel size and pool of a window that has at most ``MAX_WINDOW_CELLS`` cells a side."""
+    pool = 1
+    while 2 * belief.half_m / (gsd * stride * pool) > MAX_WINDOW_CELLS:
+        pool, gsd = (2 * pool, gsd) if stride * pool < MAX_STRIDE else (pool, 2.0 * gsd)
+    return gsd, pool
 
 
 def view_at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:

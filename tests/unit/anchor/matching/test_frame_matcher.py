@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from terrafix.anchor.matching import frame_matcher
 from terrafix.anchor.matching.frame_matcher import (
     LEARNED_INLIERS,
     MAX_FINE_HYPOTHESES,
@@ -324,6 +325,22 @@ def test_of_many_hypotheses_the_best_are_correlated_on_fine_cells_and_find_the_p
     assert many.cell_m == few.cell_m
     hypothesis, z = many.best_at(TRUE_M[0], TRUE_M[1])
     assert z > 5.0 and hypothesis == Hypothesis(pytest.approx(np.radians(7.0)), 1.0)  # type: ignore[arg-type]
+
+
+def test_a_wide_window_is_correlated_on_means_of_fine_descriptors(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ground whose only structure is finer than the cells of the window: a map of larger pixels would show none."""
+    fine = np.random.default_rng(4).integers(0, 255, (480, 480, 3), np.uint8)
+    clods = cv2.resize(fine, (960, 960), interpolation=cv2.INTER_LINEAR)
+    flat = (ground[:960, :960] * 0.0 + clods).astype(np.uint8)
+    matcher, place_m = FrameMatcher(PINHOLE, FlatMap(flat), GradientDescriber()), np.array([22.0, -31.0, AGL_M])  # type: ignore[arg-type]
+    seen, belief = view(flat, PINHOLE, TRUE_R, place_m), Belief(0.0, 0.0, 30.0, CELL_M)
+    narrow = matcher.correlate(seen, predicted_view(), belief)
+    monkeypatch.setattr(frame_matcher, "MAX_WINDOW_CELLS", int(2 * belief.half_m / narrow.cell_m / 3))
+    wide = matcher.correlate(seen, predicted_view(), belief)
+    assert wide.cell_m == 4.0 * narrow.cell_m
+    assert wide.best_at(place_m[0], place_m[1])[1] > 6.0
 
 
 def test_the_best_hypotheses_keep_their_order() -> None:

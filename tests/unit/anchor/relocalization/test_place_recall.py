@@ -12,8 +12,8 @@ from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.verification.hypothesis_tracker import MERGE_RADIUS
 from terrafix.core.errors import MapError
 from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget
+from terrafix_tools.models.two_dates import TrueView, TwoDates
 from textured_ground import texture
-from two_dates import TrueView, TwoDates
 
 REQUIRED, AMONG, PLACES, SEED = 0.85, 5, 80, 1
 NIGHTLY = ("joplin", "adiyaman-6", "gaziantep-2")  # towns

@@ -19,7 +19,6 @@ from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import ensure_package
 from terrafix_tools.mapping.source import ImagerySource
-from terrafix_tools.models.pair import same_grid
 
 CAMERA = CameraCalibration(640, 480, 554.0, 554.0, 319.5, 239.5)  # 60 degrees wide
 NORTH_UP = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # camera to world, looking straight down
@@ -104,3 +103,16 @@ class TwoDates:
         matrix[:, 2] = centre_px - matrix[:, :2] @ (CAMERA.cx, CAMERA.cy)
         size = (CAMERA.width, CAMERA.height)
         return np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+
+
+def same_grid(first: Path, second: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Returns both images on the grid of the second one, (H, W, 3) uint8 BGR."""
+    with ImagerySource(first) as one, ImagerySource(second) as two:
+        if one.crs != two.crs:
+            raise MapError(f"{first}: another coordinate system than {second}; bring it into that one with gdalwarp")
+        camera, ground = (image.read(0, 0, image.width_px, image.height_px)[0] for image in (one, two))
+        wider, higher = one.pixel_x / two.pixel_x, one.pixel_y / two.pixel_y
+        east_px, south_px = (one.x_min - two.x_min) / two.pixel_x, (two.y_max - one.y_max) / two.pixel_y
+        # The geotransform refers to pixel corners; OpenCV's coordinates to pixel centres.
+        matrix = np.array([[wider, 0, east_px + 0.5 * wider - 0.5], [0, higher, south_px + 0.5 * higher - 0.5]])
+    return cv2.warpAffine(camera, matrix, (ground.shape[1], ground.shape[0]), flags=cv2.INTER_LINEAR), ground
