@@ -129,7 +129,7 @@ class Propagation:
         if rejected is not None:
             registered = registered.without_height()
             verdicts.append(rejected)
-        if is_below_map_matching(state, registered.predicted.frame.attitude, registered.p_m):
+        elif is_below_map_matching(state, registered.predicted.frame.attitude, registered.p_m):
             return self._reset_height(registered, verdicts)
         return self._add_node(registered, verdicts)
 

@@ -39,7 +39,7 @@ def test_the_shipped_manifests_have_a_source_and_a_licence() -> None:
         (('licence = "CC0"\n', 'licence = "CC0"\nlicense = "CC0"\n'), "unknown field `license`"),
         (('file = "tiny.onnx"', 'file = "../tiny.onnx"'), "file"),
         (('input = "input"', 'input = "image"'), "'image' is used, but neither"),
-        (('name = "reliability"', 'name = "certainty"'), "'reliability' is used, but neither"),
+        (('name = "descriptors"', 'name = "certainty"'), "'descriptors' is used, but neither"),
         (("width = 64 }\n[[presets]]", "wide = 64 }\n[[presets]]"), "a preset has no size for 'width'"),
         (("height = 32", "height = 0"), "presets"),
         (('licence = "CC0"\n', 'licence = "CC0"\nsource = "ftp://host/file"\n'), "must be an http or https address"),

@@ -107,10 +107,14 @@ def test_file_is_a_cloud_optimised_geotiff_with_its_statement(mosaic: Path) -> N
     assert (stated.date, stated.flown_by, stated.flight) == ("2026-07-03", "crew 7", mosaic.parent.name)
 
 
-def test_accuracy_is_that_of_located_pixels(mosaic: Path, flight: Path) -> None:
+def test_accuracy_is_that_of_pixels_located_without_points(
+    mosaic: Path, flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stated = read_statement(mosaic)
     assert stated is not None
     locator = FlightLocator.open(flight)
+    no_points = locator.cloud(-1)
+    monkeypatch.setattr(locator, "cloud", lambda _fragment: no_points)
     middle = locator.locate([("1", (399.5, 299.5))])
     corner = locator.locate([("1", (0.25 * 799, 0.25 * 599))])
     low, high = (2.146 * np.sqrt(np.trace(found.cov[:2, :2]) / 2.0) for found in (middle, corner))

@@ -47,6 +47,7 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"picture squeezed by 1\.(19|33) in [xy]: no fix",
     r"picture (upside down|mirrored|turned by -?90 deg): not used",
     r"(the picture is right again|picture not on the map|the picture is on the map again)",
+    r"(gimbal (not reported|repeats a report|reports its servos): level assumed|the gimbal's reports are used again)",
     r"focal or ground height seems x[\d.]+ off",
     r"(focal length|scale|heading|mount yaw|mirrored picture|aspect ratio) is plausible again",
     r"autopilot (does not use the position|uses a position again)",
