@@ -72,8 +72,8 @@ from terrafix_engines.correlation import GraphCorrelator
 
 NEW_GROUND_SHARE = 0.35  # share of the footprint: motion after which an observation counts in full [tuned]
 MIN_OBSERVATION_WEIGHT = 0.08  # weight of another observation of the same ground [tuned]
-# A start coordinate that is wrong by far more than its 1-sigma: its probability (the belief's uniform share), and the
-# window that the belief keeps for it until a pose confirms the position, in sigmas and at most in metres. [tuned]
+# Of a start coordinate that is wrong by far more than its 1-sigma: the belief's uniform share until a pose confirms the
+# position. [tuned]
 START_UNIFORM_SHARE = float(np.exp(-START_LOG_ODDS))
 # 1-sigma, metres: the apparent position also contains the tilt error, which is not known at the start [tuned]
 START_SIGMA_FLOOR_M = 8.0

@@ -66,16 +66,16 @@ class Range:
     settles: bool = False
 
 
+# One start or description in twenty is wrong, as people state it, and does not change in flight; a receiver may have
+# been spoofed. Upper limit: 3600 correlations an hour, one false alarm in 1000 hours. [tuned]
+STATED = Range(math.log(0.05 / 0.95), -math.log(100_000.0), math.log(3600.0 * 1000.0), settles=True)
 RANGES: dict[Cause, Range] = {
     # Until map matches that agree with each other contradict the estimate, there is no evidence for another place.
     Cause.ELSEWHERE: Range(-math.inf, -math.inf, 0.0),
     # A map that was right for a kilometre can still end. [tuned]
     Cause.OTHER_GROUND: Range(-6.0, -6.0, 4.0),
-    # People state a start as they state a description. A receiver may have been spoofed. [tuned]
-    Cause.START: Range(math.log(0.05 / 0.95), -math.log(100_000.0), math.log(3600.0 * 1000.0), settles=True),
-    # One description in twenty is wrong, and none of it changes in flight. Upper limit: 3600 correlations an hour, one
-    # false alarm in 1000 hours. [tuned]
-    Cause.DESCRIPTION: Range(math.log(0.05 / 0.95), -math.log(100_000.0), math.log(3600.0 * 1000.0), settles=True),
+    Cause.START: STATED,
+    Cause.DESCRIPTION: STATED,
 }
 
 

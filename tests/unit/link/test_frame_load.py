@@ -54,9 +54,9 @@ def test_a_load_at_the_limit_is_reported_seldom() -> None:
     assert len(texts_of(([True] * 20 + [False] * 20) * 10)) <= 10  # 200 s; 20 changes
 
 
-@pytest.mark.parametrize(("took_ms", "camera_ms", "told"), [(300, 0, 0), (700, 0, 1), (700, 600, 0), (1300, 600, 1)])
+@pytest.mark.parametrize(("took_ms", "camera_ms", "sent"), [(300, 0, 0), (700, 0, 1), (700, 600, 0), (1300, 600, 1)])
 def test_positions_that_come_after_the_next_frame_are_a_slow_computer_and_a_slow_camera_is_none(
-    took_ms: int, camera_ms: int, told: int
+    took_ms: int, camera_ms: int, sent: int
 ) -> None:
     """``camera_ms``: from the stamp of a frame to its message."""
     node, published = LinkNode(10.0), list[Message]()
@@ -66,4 +66,4 @@ def test_positions_that_come_after_the_next_frame_are_a_slow_computer_and_a_slow
         published += node.on(frame)
         late_ns = (took_ms if i > 20 else camera_ms + 50) * MS
         published += node.on(estimate(frame.t_ns, late_ns=late_ns, frame_id=i))
-    assert texts(published) == ["Terrafix: computer too slow: 4 of 10 frames late"] * told
+    assert texts(published) == ["Terrafix: computer too slow: 4 of 10 frames late"] * sent

@@ -139,9 +139,7 @@ def read_views(record: Path) -> FlightViews:
             before, view = views[finalised], cameras.at(views[finalised], row.pose(finalised))
             if lens is not None:
                 view = replace(view, calibration=lens.on(view.calibration))
-            elif (
-                finalised in refined
-            ):  # the same pose: height and rays by the described lens, which have its error alike
+            elif finalised in refined:  # height and rays by the described lens, which have its error alike
                 view = replace(view, cov=before.cov)
             views[finalised] = view
     return FlightViews(origin, frame, views, triples, frames, result.header)

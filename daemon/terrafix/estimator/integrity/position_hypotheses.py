@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.core.agreement import Agreement, Cause
+from terrafix.core.agreement import Agreement, Cause, Observed
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.core.initial_position import SEARCH_START_SIGMA_M, START_WINDOW_MAX_M, START_WINDOW_SIGMAS
 from terrafix.core.pose import positive_part
@@ -98,7 +98,7 @@ class PositionHypotheses:
     def on_match_accepted(self) -> None:
         """A map match agreed with the estimate."""
         self._start_sigma_m, self._modes, self._belief = 0.0, (), None
-        self._agreement.begin(Cause.START, -math.inf)
+        self._agreement.observe(Observed.POSE, Cause.START)
 
     def on_relocalized(self) -> None:
         """What matches said before does not count: a search over several frames has found the position, or they were

@@ -70,9 +70,8 @@ class AhrsCorrectionMonitor:
         attitude = self._telemetry.at(t_ns)
         extra_rad = self._extra_tilt_sigma_rad(t_ns * 1e-9, tilt_sigma_rad)
         attitude = _widened(attitude, extra_rad)
-        if attitude.vehicle is not None:
-            attitude = replace(attitude, vehicle=_widened(attitude.vehicle, extra_rad))
         if attitude.vehicle is not None:  # a gimbal levels by gyroscopes of its own
+            attitude = replace(attitude, vehicle=_widened(attitude.vehicle, extra_rad))
             out = out * (0.0, 0.0, 1.0)
         if not out.any() or attitude.yaw_rad is None or attitude.pitch_rad is None or attitude.roll_rad is None:
             return attitude

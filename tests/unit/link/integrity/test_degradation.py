@@ -173,7 +173,7 @@ def test_named_values_are_sent_once_a_second_after_an_autopilot_is_connected() -
     assert math.isnan(lost["TFX_ACC_M"]) and math.isnan(lost["TFX_MAP_S"])
 
 
-def told_of(fault: m.CalibrationFault, lasts_ns: int = 6 * S) -> list[m.StatusText]:
+def texts_on(fault: m.CalibrationFault, lasts_ns: int = 6 * S) -> list[m.StatusText]:
     """Texts about a fault that begins, and ends ``lasts_ns`` later."""
     node, end_ns = LinkNode(10.0), fault.t_ns + lasts_ns
     published = [*node.on(fault), *node.on(msgspec.structs.replace(fault, t_ns=end_ns, active=False))]
@@ -193,7 +193,7 @@ def told_of(fault: m.CalibrationFault, lasts_ns: int = 6 * S) -> list[m.StatusTe
     ],
 )
 def test_a_calibration_fault_and_its_end_are_reported_to_the_pilot(quantity: str, factor: float | None) -> None:
-    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
+    began, ended = texts_on(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
     assert is_known(began.text) and began.text.endswith("no fix") and began.severity == 2
     assert is_known(ended.text) and "no fix" not in ended.text and ended.severity == 6
 
@@ -204,7 +204,7 @@ def test_a_calibration_fault_and_its_end_are_reported_to_the_pilot(quantity: str
 def test_a_picture_that_turns_in_flight_is_reported_to_the_pilot_as_not_used(
     quantity: str, factor: float | None
 ) -> None:
-    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
+    began, ended = texts_on(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
     assert is_known(began.text) and quantity in began.text and began.text.endswith("not used") and began.severity == 2
     assert ended.text == "Terrafix: the picture is right again" and ended.severity == 6
 
@@ -213,10 +213,10 @@ def test_a_picture_that_turns_in_flight_is_reported_to_the_pilot_as_not_used(
     ("quantity", "factor", "text"),
     [("focal length", 1.28, "focal or ground height seems x1.28 off"), ("picture not on the map", None, None)],
 )
-def test_a_fault_that_the_claim_contains_is_told_without_a_word_of_the_fix(
+def test_a_fault_that_the_claim_contains_is_reported_without_a_word_of_the_fix(
     quantity: str, factor: float | None, text: str | None
 ) -> None:
-    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
+    began, ended = texts_on(m.CalibrationFault(t_ns=S, quantity=quantity, factor=factor, detail="", active=True))
     assert began.text == f"Terrafix: {text or quantity}" and ended.severity == 6
     assert is_known(began.text) and is_known(ended.text)
 
@@ -224,12 +224,12 @@ def test_a_fault_that_the_claim_contains_is_told_without_a_word_of_the_fix(
 @pytest.mark.parametrize("quantity", LINK_FAULTS)
 def test_telemetry_and_frames_that_are_left_out_are_a_warning_by_their_cause(quantity: str) -> None:
     detail = "6 of 10 frames late"
-    began, ended = told_of(m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail=detail, active=True))
+    began, ended = texts_on(m.CalibrationFault(t_ns=S, quantity=quantity, factor=None, detail=detail, active=True))
     assert is_known(began.text) and quantity in began.text and began.severity == 4
     assert is_known(ended.text) and ended.severity == 6
 
 
-def test_a_fault_that_comes_and_goes_is_told_seldom_and_its_last_state_is() -> None:
+def test_a_fault_that_comes_and_goes_is_reported_seldom_and_its_last_state_is() -> None:
     fault = m.CalibrationFault(t_ns=0, quantity=TWO_SENDERS, factor=None, detail="", active=True)
 
     def feed(now_ns: int) -> list[m.Message]:
@@ -237,8 +237,8 @@ def test_a_fault_that_comes_and_goes_is_told_seldom_and_its_last_state_is() -> N
             return []
         return [msgspec.structs.replace(fault, t_ns=now_ns, active=now_ns // S % 2 == 0)]
 
-    told = [text for text in texts(fly(LinkNode(10.0), 0, 130 * S, feed)) if "sender" in text]
-    assert len(told) <= 8 and told[-1] == f"Terrafix: {TWO_SENDERS}, one ignored"
+    sent = [text for text in texts(fly(LinkNode(10.0), 0, 130 * S, feed)) if "sender" in text]
+    assert len(sent) <= 8 and sent[-1] == f"Terrafix: {TWO_SENDERS}, one ignored"
 
 
 def test_a_text_has_the_time_at_which_it_is_sent_not_that_at_which_its_fault_began() -> None:
