@@ -13,7 +13,7 @@ import numpy as np
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.covariances import Covariances
 from terrafix.estimator.graph.pose_graph import PoseGraph
-from terrafix.estimator.integrity.fragments import Fragment, Fragments
+from terrafix.estimator.integrity.fragments import ContradictedImages, Fragment, Fragments
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.yaw_gauge import YawGauge
 from terrafix.estimator.keyframe_store import KeptKeyframe, KeyframeStore
@@ -128,8 +128,7 @@ class FilterState:
         self.newest_odometry: Odometry | None = None  # as vision published it
         # Time of the newest implausible odometry, and by which it was off the prediction, east and north.
         self.image_jump: tuple[float, Innovation] | None = None  # None: none since a match
-        # Images have contradicted inertial readings for so long that one of the two is wrong, and no place has decided.
-        self.images_contradicted = False
+        self.contradicted_images = ContradictedImages()
         self.orientation = OrientationMonitor()
         self.motion_cov = np.zeros((MOTION_SIZE, MOTION_SIZE))  # of V of the newest node
         self.lens_sigma = radial_k1_sigma(origin.camera)  # of its radial coefficient

@@ -13,7 +13,7 @@ from terrafix.estimator.graph.pose_graph import GraphPrior
 from terrafix.estimator.initialization import ResetReason, reset
 from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT
 from terrafix.estimator.integrity.correlated_fixes import CorrelatedFixes
-from terrafix.estimator.integrity.fragments import MapHitRate
+from terrafix.estimator.integrity.fragments import MapHitRate, MatchedFrame
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_run import InnovationRun
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
@@ -52,12 +52,14 @@ NOTHING_FOUND = (Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE)
 class MapResult:
     """What was done with a map match: ``fusion``, the verdict on it, and ``others``: on a start coordinate that the map
     contradicts, and on a reset of the graph. ``fixed``: of an accepted match, for the smoother. ``off``: (2,) of a pose
-    from the estimate of its frame, of one that the gate has rejected or that is fused."""
+    from the estimate of its frame, of one that the gate has rejected or that is fused. ``images_agree``: images that had
+    contradicted inertial readings agree with the way to this match."""
 
     fusion: FusionVerdict
     others: tuple[FusionVerdict, ...] = ()
     fixed: FixedPose | None = None
     off: Innovation | None = None
+    images_agree: bool = False
 
     @property
     def verdict(self) -> Verdict:
@@ -182,12 +184,14 @@ class MapUpdate:
             return self._reject(match, node, measurement, fusion.innovation)
         self._rejected.clear()
         off = None if match.position_only else measurement.position_innovation(*predicted)
+        contradicted = state.contradicted_images.active
         if not match.position_only:
             self.hypotheses.other_ground.on_pose(share, position)
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
         state.covariances.record(node)
-        return MapResult(replace(fusion, detail=f"information share {share:.2f}"), fixed=fixed, off=off)
+        agree = contradicted and not state.contradicted_images.active
+        return MapResult(replace(fusion, detail=f"information share {share:.2f}"), (), fixed, off, agree)
 
     def _learn_from_pose(self, match: MapMatch, node: int, before: NodeState, measurement: MapPoseMeasurement) -> None:
         """Updates terrain roughness, alternative position and map hit rate with an accepted pose. ``before``: the node
@@ -200,12 +204,26 @@ class MapUpdate:
         if self._fixes.newest_s is not None:
             new_m = self._fixes.new_ground_m(state.graph.time_of(node), here, math.inf)
             self.hypotheses.other.on_pose(new_m / height_m, _place_mass(match))
-        self._map_hit_rate.update(state.fragments.of(node), found=True)
+        self._weigh_fragment(node, measurement)
+
+    def _weigh_fragment(self, node: int, measurement: MapPoseMeasurement) -> None:
+        """A pose joins the fragment of its frame, unless its images have contradicted inertial readings: then the next
+        one decides."""
+        state = self._state
+        fragment = state.fragments.of(node)
+        if state.contradicted_images.active:
+            cov_m2 = tangent_to_world(measurement.cov, measurement.pose.rotation().matrix())[HORIZONTAL, HORIZONTAL]
+            t_s, displacement_m = state.graph.time_of(node), state.fragments.displacement_m(node)
+            matched = MatchedFrame(t_s, fragment, displacement_m, measurement.position_m, cov_m2)
+            state.contradicted_images.on_map_match(matched)
+        else:
+            fragment.join()
+        self._map_hit_rate.update(fragment, found=True)
 
     def _accept(self, match: MapMatch, t_s: float, here_m: np.ndarray) -> None:
         state = self._state
         self._fixes.add(t_s, here_m)
-        state.image_jump, state.images_contradicted = None, False
+        state.image_jump = None
         if not match.position_only:  # its tilt and heading are those of upright images
             state.orientation = OrientationMonitor()
         state.last_fused_s = max(state.last_fused_s, t_s)
@@ -295,7 +313,9 @@ class MapUpdate:
             velocity, motion_cov, state.yaw_gauge = np.zeros(MOTION_SIZE), unknown_motion_cov(), None
         assert state.last is not None
         first = NodeState(measurement.pose.compose(onward), bias, velocity)
-        reset(state, state.last.frame_id, now_s, GraphPrior(first, cov, calibration_cov, motion_cov))
+        tied = not state.contradicted_images.active
+        prior = GraphPrior(first, cov, calibration_cov, motion_cov)
+        reset(state, state.last.frame_id, now_s, prior, joined=tied, confirmed=tied)
         if not position.is_accepted:  # what led to the wrong estimate is in the kept keyframes, too
             state.keyframes.clear()
         self._rejected.clear()

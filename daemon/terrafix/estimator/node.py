@@ -401,7 +401,7 @@ class EstimatorNode:
             return self._refused.add(t_ns, "")
         since_ns = self._unseen.since_ns
         known = None if since_ns is None else (UNSEEN, since_ns)
-        return self._refused.add(t_ns, INPUT_KINDS.get(verdict), (OTHER, t_ns) if state.images_contradicted else known)
+        return self._refused.add(t_ns, INPUT_KINDS.get(verdict), (OTHER, t_ns) if state.contradicted_images.active else known)
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved
@@ -543,6 +543,8 @@ class EstimatorNode:
         if accepted:
             flight.time_offset.agree()
         if self._monitors is not None:
+            if result.images_agree:
+                self._monitors.on_images_agree()
             yield from self._monitors.take_changes(match.t_ns)
         changed = accepted or was_multimodal or estimator.hypotheses.is_multimodal or result.verdict is Verdict.LOST
         if changed and estimator.last is not None:

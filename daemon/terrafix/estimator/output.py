@@ -103,7 +103,7 @@ def estimate_of(
     """``tracked``: odometry, a relocalisation or a map match of this frame was fused. ``t_ns``: of the newest
     measurement in it."""
     fragment = estimator.state.fragment_of(frame.frame_id)
-    connected = fragment is None or fragment.joined
+    connected = fragment is None or fragment.joined or estimator.last_fix_s == frame.t_s
     state, p, v = estimator.state, frame.pose.translation(), frame.velocity_mps
     scale, _ = state.height_scale(frame.node)
     lat_deg, lon_deg = axes.to_wgs84(*claim.position_m.tolist())

@@ -197,11 +197,13 @@ class Propagation:
             against = "inertial readings" if self._motion_refused.inertial else "velocity"
             detail = f"odometry contradicts {against} for {MOTION_TIMEOUT_S:.0f} s"
             reset = _reset_verdict(ResetReason.MOTION_TIMEOUT, detail)
-            state.images_contradicted = self._motion_refused.inertial
+            inertial = self._motion_refused.inertial
             self._motion_refused = None  # velocity is unknown from here on: the next one has its own time
-            return self._continue(
-                replace(predicted, cov=cov), [*verdicts, reset], confirmed=not state.images_contradicted
-            )
+            if inertial:
+                state.contradicted_images.begin()
+            else:
+                state.contradicted_images.end()
+            return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=not inertial)
         if self._is_velocity_wrong(odometry) and predicted.increment is not None:
             return self._reset_velocity(predicted, verdicts)
         if (off_mps := self._start_off_mps(predicted)) is not None:
@@ -227,7 +229,7 @@ class Propagation:
         if innovation.inertial:
             off_mps = self._signed.largest_m / innovation.dt_s
             cov[DELTA_V, DELTA_V][HORIZONTAL, HORIZONTAL] += np.outer(off_mps, off_mps)
-            self._state.images_contradicted = True
+            self._state.contradicted_images.begin()
         else:
             cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
         self._signed.forget()

@@ -120,8 +120,11 @@ def _odometry_step(
 
 
 def _fragment_step(state: FilterState, odometry: GatedOdometry, p_m: np.ndarray, step: Step) -> Step:
-    """The step for the anchor's belief follows the images, also those of a fragment that is not confirmed."""
+    """The step for the anchor's belief follows the images, also those of a fragment that is not confirmed,
+    unless they have contradicted inertial readings."""
     last = state.fragment
+    if state.contradicted_images.active:
+        return step
     if odometry.fragment is last and odometry.local_step_m is not None:
         length_m = float(np.hypot(*odometry.local_step_m))
         return Step(odometry.local_step_m, STEP_FLOOR_M + STEP_SHARE * length_m)

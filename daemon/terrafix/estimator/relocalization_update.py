@@ -59,7 +59,7 @@ class RelocalizationUpdate:
         self._run.add(np.zeros(2), here_m, position_only=False)
         if keyframe.fragment.joined:
             state.fragments.of(node).join()
-            state.images_contradicted = False
+            state.contradicted_images.end()
         return RelocalizationResult(fusion, measurement)
 
 

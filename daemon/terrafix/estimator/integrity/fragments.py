@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from terrafix.core.gate import CHI2_95, SIGMAS_95
+
 FOREIGN_SPEED_MPS = 30.0  # m/s: images of another flight move with up to this, in any direction [tuned]
 CONFIRM_LLR = 3.0  # nats per frame: 1 in 20 foreign motions is as close to the prediction by chance [tuned]
 CONSISTENT_D2 = 1.39  # squared Mahalanobis distance [spec: chi-square, 2 degrees of freedom, 50 %]
@@ -24,6 +26,9 @@ CONFIRM_FRAMES = 2  # consecutive frames with sufficient evidence [tuned]
 # A fragment of this duration [s] and length [frames] is confirmed without evidence, with the position covariance of
 # dead reckoning. Over ground that the map does not match, nothing else would confirm it. [tuned]
 CONFIRM_AFTER_S, CONFIRM_AFTER_FRAMES = 30.0, 20
+# Share of a way by which images that are squeezed, or of another focal length, tell it wrong.
+WRONG_SHARE = 0.25  # [spec: 16:9 in 4:3]
+ODOMETRY_SHARE = 0.04  # of a way: error of odometry over real ground, where nothing corrects it [tuned]
 
 
 @dataclass
@@ -69,6 +74,54 @@ class Fragment:
             self.join()
 
 
+@dataclass(frozen=True)
+class MatchedFrame:
+    """A frame of ``fragment`` at ``t_s``, ``displacement_m`` (2,) by odometry from the first frame of the fragment.
+    ``position_m`` (2,), with covariance ``cov_m2`` (2, 2): of its map match, east and north."""
+
+    t_s: float
+    fragment: Fragment
+    displacement_m: np.ndarray
+    position_m: np.ndarray
+    cov_m2: np.ndarray
+
+
+@dataclass
+class ContradictedImages:
+    """Images have contradicted inertial readings (``active``): one of the two is wrong. A map match of such an image
+    gives a position, and says nothing of the motion that images show: a squeezed image is matched, and its odometry is
+    wrong by a quarter. So two map matches decide, by the way between them."""
+
+    active: bool = False
+    _first: MatchedFrame | None = None
+
+    def begin(self) -> None:
+        self.active, self._first = True, None
+
+    def end(self) -> None:
+        self.active, self._first = False, None
+
+    def on_map_match(self, frame: MatchedFrame) -> None:
+        """The images are right, and their fragment is joined, where odometry agrees with a way that is long enough to
+        tell, or for CONFIRM_AFTER_S: over one place nothing can tell."""
+        first = self._first
+        if first is None or first.fragment is not frame.fragment:
+            self._first = frame
+            return
+        way_m = frame.position_m - first.position_m
+        length_m = float(np.hypot(*way_m))
+        off_m = frame.displacement_m - first.displacement_m - way_m
+        cov_m2 = first.cov_m2 + frame.cov_m2 + (ODOMETRY_SHARE * length_m) ** 2 * np.eye(2)
+        if off_m @ np.linalg.solve(cov_m2, off_m) > CHI2_95:
+            self._first = frame
+        elif (
+            WRONG_SHARE * length_m > 2.0 * SIGMAS_95 * math.sqrt(np.linalg.eigvalsh(cov_m2)[-1])
+            or frame.t_s - first.t_s >= CONFIRM_AFTER_S
+        ):
+            frame.fragment.join()
+            self.end()
+
+
 class MapHitRate:
     """Share of the correlations with the map that find a pose, in confirmed fragments."""
 
@@ -76,11 +129,9 @@ class MapHitRate:
         self._rate = 0.0
 
     def update(self, fragment: Fragment, *, found: bool) -> None:
-        """One correlation of a frame of ``fragment``. A pose joins the fragment; no pose is evidence against it, the
-        more so the higher the hit rate is."""
-        if found:
-            fragment.join()
-        elif not fragment.confirmed:
+        """One correlation of a frame of ``fragment``. No pose is evidence against it, the more so the higher the hit
+        rate is."""
+        if not found and not fragment.confirmed:
             fragment.map_llr += math.log(1.0 - min(self._rate, MAX_HIT_RATE))
         if fragment.confirmed:
             self._rate += (float(found) - self._rate) / HIT_RATE_MEMORY

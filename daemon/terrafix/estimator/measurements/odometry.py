@@ -172,7 +172,7 @@ class OdometryMeasurement:
         turns_agree = heading.mahalanobis2 <= HEADING_GATE**2
         inertial = innovation.inertial and self._state.continuity.inertial_since_fused
         evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree, inertial)
-        fragment.add_frame(frame.t_s, evidence, only_by_place=self._state.images_contradicted)
+        fragment.add_frame(frame.t_s, evidence, only_by_place=self._state.contradicted_images.active)
 
     def three_view(self, seen: KeyframeMotion) -> tuple[int, ThreeViewConstraint] | None:
         """The constraint of points that the keyframe before, the keyframe and the frame saw, and the node of the

@@ -176,6 +176,10 @@ class Monitors:
             self._height.add(log_height_ratio(reported_m, observed_m))
             self._focal.add(log_height_ratio(reported_m, observed_m))
 
+    def on_images_agree(self) -> None:
+        """Images that had contradicted inertial readings show the way between two places of the map again."""
+        self._shape = ShapeMonitor()
+
     def take_changes(self, t_ns: int) -> list[CalibrationFault]:
         """Faults that have begun, changed or ended since the last call."""
         now = self._active_findings()
