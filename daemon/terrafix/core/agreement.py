@@ -37,12 +37,15 @@ P_REJECTED, P_REJECTED_OTHER_GROUND = 0.1, 0.9
 # degrees off or a camera mounted sideways, one pose entered the graph in 450 correlations of five simulated flights.
 # [measured: docs/decisions/024-calibration-monitors.md]
 P_NOTHING, P_NOTHING_DESCRIPTION = 0.2, 0.99
+# ... and over ground that the map does not show, where one in five gives a pose. [measured: docs/monte-carlo.md]
+P_NOTHING_OTHER_GROUND = 0.8
 # Heights of new ground over which a repeating pattern becomes less probable by 1/e: its length. [tuned]
 PATTERN_HEIGHTS = 5.0
 
 # Rows: for a unit of new ground, which for ELSEWHERE is one height above ground, for OTHER_GROUND the share of the pose
 # that is independent of those before (correlated_fixes.py), for START and DESCRIPTION one correlation over other ground
-# than before. Correlations without a pose do not count for OTHER_GROUND: over bare ground they are frequent as well.
+# than before. Correlations without a pose count for OTHER_GROUND by the hit rate of the flight (other_ground.py): over
+# bare ground they are frequent.
 NATS: dict[Observed, dict[Cause, float]] = {
     Observed.POSE: {
         Cause.ELSEWHERE: -1.0 / PATTERN_HEIGHTS,

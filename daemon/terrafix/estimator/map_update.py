@@ -97,6 +97,9 @@ class MapUpdate:
             if lost := self._update_belief(match, node):
                 return _result(Verdict.LOST, lost)
         if node is not None and (match.position_only or match.verdict in NOTHING_FOUND):
+            p_m = state.graph.state(node).pose.translation()
+            height_m = max(state.terrain.height_above_m(p_m), 1.0)
+            self.hypotheses.other_ground.on_nothing(p_m[HORIZONTAL], height_m, self._map_hit_rate.p_nothing)
             self._map_hit_rate.update(state.fragments.of(node), found=False)
         if match.verdict is not Verdict.ACCEPTED:
             return _result(match.verdict, f"{match.inliers} inliers" if match.verdict in NOTHING_FOUND else "")
@@ -186,7 +189,7 @@ class MapUpdate:
         off = None if match.position_only else measurement.position_innovation(*predicted)
         contradicted = state.contradicted_images.active
         if not match.position_only:
-            self.hypotheses.other_ground.on_pose(share, position)
+            self.hypotheses.other_ground.on_pose(share, position, height_m)
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
         state.covariances.record(node)

@@ -128,11 +128,16 @@ class MapHitRate:
     def __init__(self) -> None:
         self._rate = 0.0
 
+    @property
+    def p_nothing(self) -> float:
+        """Probability that a correlation finds no pose over ground like that before."""
+        return 1.0 - min(self._rate, MAX_HIT_RATE)
+
     def update(self, fragment: Fragment, *, found: bool) -> None:
         """One correlation of a frame of ``fragment``. No pose is evidence against it, the more so the higher the hit
         rate is."""
         if not found and not fragment.confirmed:
-            fragment.map_llr += math.log(1.0 - min(self._rate, MAX_HIT_RATE))
+            fragment.map_llr += math.log(self.p_nothing)
         if fragment.confirmed:
             self._rate += (float(found) - self._rate) / HIT_RATE_MEMORY
 

@@ -124,7 +124,9 @@ class PositionHypotheses:
         wrong_m2 = self._agreement.weight(Cause.DESCRIPTION) * path_error_m**2 + self.other_ground.variance_m2
         wrong_m2 += self._agreement.weight(Cause.START) * self._start_error_m**2
         anywhere_m2 = max(self.anywhere_m, self._start_sigma_m) ** 2
-        cov[:2, :2] = right * moments_m2 + self.other.moments_m2() + (wrong_m2 + anywhere_m2) * np.eye(2)
+        # By a cause that is no place of its own the vehicle has moved as the estimate has, and as uncertainly.
+        moved = 1.0 - self._agreement.weight(Cause.START)
+        cov[:2, :2] = moved * moments_m2 + self.other.moments_m2() + (wrong_m2 + anywhere_m2) * np.eye(2)
         return offset_m, cov
 
     def _moments_with_modes(self, estimate_m2: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
