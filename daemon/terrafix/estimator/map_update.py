@@ -13,7 +13,7 @@ from terrafix.estimator.graph.pose_graph import GraphPrior
 from terrafix.estimator.initialization import ResetReason, reset
 from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT
 from terrafix.estimator.integrity.correlated_fixes import CorrelatedFixes
-from terrafix.estimator.integrity.fragments import MapHitRate, MatchedFrame
+from terrafix.estimator.integrity.fragments import STEP_SHARE, MapHitRate, MatchedFrame
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_run import InnovationRun
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
@@ -28,7 +28,6 @@ from terrafix.estimator.measurements.map_pose import (
 from terrafix.estimator.models.motion_model import unknown_motion_cov
 from terrafix.estimator.monitors.image_orientation import OrientationMonitor
 from terrafix.estimator.propagation import MOTION_TIMEOUT_S
-from terrafix.estimator.registration import STEP_SHARE
 from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import MapMatch, Verdict
 

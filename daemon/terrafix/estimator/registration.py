@@ -10,13 +10,13 @@ import numpy as np
 
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.filter_state import FilterState, FrameInput
+from terrafix.estimator.integrity.fragments import STEP_SHARE
 from terrafix.estimator.measurements.odometry import GatedOdometry, KeyframeMotion
 from terrafix.estimator.measurements.telemetry_buffer import TURN_UNSEEN_RAD, UNKNOWN_ATTITUDE_RAD
 from terrafix.estimator.models.motion_model import STATIONARY_M, MotionIncrement, fuse_odometry_increment
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.state import DELTA_P, TRANSLATION, NodeState
 
-STEP_SHARE = 0.04  # of a step: error of odometry over real ground, for the point mass filter of the anchor [tuned]
 STEP_FLOOR_M = 0.5  # [tuned]
 
 

@@ -28,7 +28,7 @@ CONFIRM_FRAMES = 2  # consecutive frames with sufficient evidence [tuned]
 CONFIRM_AFTER_S, CONFIRM_AFTER_FRAMES = 30.0, 20
 # Share of a way by which images that are squeezed, or of another focal length, tell it wrong.
 WRONG_SHARE = 0.25  # [spec: 16:9 in 4:3]
-ODOMETRY_SHARE = 0.04  # of a way: error of odometry over real ground, where nothing corrects it [tuned]
+STEP_SHARE = 0.04  # of a step: error of odometry over real ground, where nothing corrects it [tuned]
 
 
 @dataclass
@@ -111,7 +111,7 @@ class ContradictedImages:
         way_m = frame.position_m - first.position_m
         length_m = float(np.hypot(*way_m))
         off_m = frame.displacement_m - first.displacement_m - way_m
-        cov_m2 = first.cov_m2 + frame.cov_m2 + (ODOMETRY_SHARE * length_m) ** 2 * np.eye(2)
+        cov_m2 = first.cov_m2 + frame.cov_m2 + (STEP_SHARE * length_m) ** 2 * np.eye(2)
         if off_m @ np.linalg.solve(cov_m2, off_m) > CHI2_95:
             self._first = frame
         elif (

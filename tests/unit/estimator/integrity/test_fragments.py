@@ -105,7 +105,7 @@ def test_the_map_hit_rate_is_an_average_over_ten_correlations() -> None:
     for _ in range(10):
         hits.update(own, found=True)
     hits.update(new, found=False)
-    assert new.map_llr == pytest.approx(10.0 * math.log(0.9))
+    assert new.map_llr == pytest.approx(10.0 * math.log(0.9)) == pytest.approx(math.log(hits.p_nothing))
     hits.update(own, found=False)
     assert own.map_llr == 0.0
     later = Fragment(0.0)

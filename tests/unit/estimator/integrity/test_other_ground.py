@@ -98,6 +98,36 @@ def test_after_any_number_of_accepted_poses_three_rejected_ones_inflate_the_cova
     assert probability(after_rejected(consistency, 3)) > 0.5
 
 
+def test_ground_that_shows_nothing_widens_no_claim_and_makes_the_first_pose_of_a_wide_gate_doubtful() -> None:
+    """Dead reckoning has led 290 m astray, and a pose puts the flight 400 m away: the claim reaches back."""
+    ground, wide = OtherGround(Agreement()), innovation(np.array([400.0, 0.0]), 290.0**2 * np.eye(2))
+    for i in range(8):
+        ground.on_nothing(np.array([30.0 * i, 0.0]), HEIGHT_M, 0.2)
+    assert ground.variance_m2 == 0.0
+    ground.on_pose(1.0, wide, HEIGHT_M)
+    assert ground.variance_m2 == pytest.approx(probability(ground) * (400.0**2 + 2.0 * 290.0**2))
+    assert probability(ground) > 0.9
+    for _ in range(4):
+        ground.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
+    assert ground.variance_m2 == 0.0  # four poses over new ground agree
+    known = OtherGround(Agreement())  # no frame has shown nothing
+    known.on_pose(1.0, wide, HEIGHT_M)
+    assert known.variance_m2 == 0.0
+
+
+@pytest.mark.parametrize(("p_nothing", "grows"), [(0.1, True), (0.8, False)])
+def test_ground_that_shows_nothing_counts_by_the_hit_rate_of_the_flight_and_once_a_place(
+    p_nothing: float, *, grows: bool
+) -> None:
+    flying, hovering = OtherGround(Agreement()), OtherGround(Agreement())
+    for i in range(6):
+        flying.on_nothing(np.array([0.0, 26.0 * i]), HEIGHT_M, p_nothing)
+        hovering.on_nothing(np.array([0.0, 4.0 * i]), HEIGHT_M, p_nothing)
+    odds = flying.agreement.log_odds[Cause.OTHER_GROUND]
+    assert (odds > 0.0) == grows
+    assert hovering.agreement.log_odds[Cause.OTHER_GROUND] == pytest.approx(-6.0 + max(0.0, np.log(0.8 / p_nothing)))
+
+
 def test_a_pose_that_was_fused_outside_of_the_gate_of_its_position_is_no_evidence_for_the_map() -> None:
     consistency = after_rejected(OtherGround(Agreement()), 4)
     before = probability(consistency)
