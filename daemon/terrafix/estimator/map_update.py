@@ -51,8 +51,8 @@ NOTHING_FOUND = (Verdict.AMBIGUOUS, Verdict.FEW_INLIERS, Verdict.DEGENERATE)
 class MapResult:
     """What was done with a map match: ``fusion``, the verdict on it, and ``others``: on a start coordinate that the map
     contradicts, and on a reset of the graph. ``fixed``: of an accepted match, for the smoother. ``off``: (2,) of a pose
-    from the estimate of its frame, of one that the gate has rejected or that is fused. ``images_agree``: images that had
-    contradicted inertial readings agree with the way to this match."""
+    from the estimate of its frame, of one that the gate has rejected or that is fused. ``images_agree``: images that
+    had contradicted inertial readings agree with the way to this match."""
 
     fusion: FusionVerdict
     others: tuple[FusionVerdict, ...] = ()

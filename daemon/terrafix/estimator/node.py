@@ -401,7 +401,9 @@ class EstimatorNode:
             return self._refused.add(t_ns, "")
         since_ns = self._unseen.since_ns
         known = None if since_ns is None else (UNSEEN, since_ns)
-        return self._refused.add(t_ns, INPUT_KINDS.get(verdict), (OTHER, t_ns) if state.contradicted_images.active else known)
+        return self._refused.add(
+            t_ns, INPUT_KINDS.get(verdict), (OTHER, t_ns) if state.contradicted_images.active else known
+        )
 
     def _start_fault(self, estimator: Estimator, t_ns: int) -> Iterable[Message]:
         moved = estimator.state.start_moved

@@ -29,9 +29,9 @@ def _returns(value: Any = None) -> Callable[..., Any]:
     return lambda *_, **__: value
 
 
-def _join(_rate: Any, fragment: Any, *, found: bool) -> None:
-    if found:
-        fragment.join()
+def _believe(images: Any, frame: Any) -> None:
+    frame.fragment.join()
+    images.end()
 
 
 def _confirm(fragment: Any, _t_s: float, _evidence: Any) -> None:
@@ -49,7 +49,11 @@ MECHANISMS: dict[str, Mechanism] = {
         {"update": _returns(), "passed": property(_returns(True)), "wrong_probability": property(_returns(0.0))},
     ),
     "place": Mechanism(f"{_ANCHOR}.converged_place", "PlaceTest", {"update": lambda *_, dominant: dominant}),
-    "map": Mechanism(f"{_INTEGRITY}.other_ground", "OtherGround", {"on_rejected": _returns(), "on_pose": _returns()}),
+    "map": Mechanism(
+        f"{_INTEGRITY}.other_ground",
+        "OtherGround",
+        {"on_rejected": _returns(), "on_pose": _returns(), "on_nothing": _returns()},
+    ),
     "alternative": Mechanism(
         f"{_INTEGRITY}.alternative_position",
         "AlternativePosition",
@@ -57,7 +61,8 @@ MECHANISMS: dict[str, Mechanism] = {
     ),
     "modes": Mechanism(f"{_INTEGRITY}.position_hypotheses", "PositionHypotheses", {"update_modes": _returns()}),
     "fragments": Mechanism(f"{_INTEGRITY}.fragments", "Fragment", {"add_frame": _confirm}),
-    "hits": Mechanism(f"{_INTEGRITY}.fragments", "MapHitRate", {"update": _join}),
+    "hits": Mechanism(f"{_INTEGRITY}.fragments", "MapHitRate", {"update": _returns()}),
+    "contradicted": Mechanism(f"{_INTEGRITY}.fragments", "ContradictedImages", {"on_map_match": _believe}),
     "correlation": Mechanism(f"{_INTEGRITY}.correlated_fixes", "CorrelatedFixes", {"information_share": _returns(1.0)}),
     "static": Mechanism(f"{_INTEGRITY}.static_picture", "StaticPicture", {"is_frozen": _returns(False)}),
     "signs": Mechanism(f"{_INTEGRITY}.signed_innovations", "SignedInnovations", {"add": _returns()}),

@@ -45,7 +45,10 @@ class OtherGround:
         """No pose was found over textured ground at ``at_m`` (2,), ``height_m`` above it. ``p_nothing``: probability of
         that over ground which the map shows (MapHitRate). By itself it widens no claim: it says how far a pose that
         is found there, or is rejected, is believed."""
-        if self._nothing_at_m is None or np.hypot(*(at_m - self._nothing_at_m)) >= REGISTRATION_SPACING_HEIGHTS * height_m:
+        if (
+            self._nothing_at_m is None
+            or np.hypot(*(at_m - self._nothing_at_m)) >= REGISTRATION_SPACING_HEIGHTS * height_m
+        ):
             self._nothing_at_m = at_m
             self.agreement.add(Cause.OTHER_GROUND, math.log(P_NOTHING_OTHER_GROUND / p_nothing))
 

@@ -131,7 +131,9 @@ def test_ground_that_shows_nothing_counts_by_the_hit_rate_of_the_flight_and_once
 def test_a_pose_that_was_fused_outside_of_the_gate_of_its_position_is_no_evidence_for_the_map() -> None:
     consistency = after_rejected(OtherGround(Agreement()), 4)
     before = probability(consistency)
-    consistency.on_pose(1.0, innovation(np.array([5.0 * 3.8, 0.0]), NARROW_M2), HEIGHT_M)  # the gate ends at 3.72 sigmas
+    consistency.on_pose(
+        1.0, innovation(np.array([5.0 * 3.8, 0.0]), NARROW_M2), HEIGHT_M
+    )  # the gate ends at 3.72 sigmas
     assert probability(consistency) == before
     consistency.on_pose(1.0, innovation(np.array([5.0 * 3.6, 0.0]), NARROW_M2), HEIGHT_M)
     assert probability(consistency) < before
