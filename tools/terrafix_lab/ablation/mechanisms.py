@@ -34,7 +34,7 @@ def _believe(images: Any, frame: Any) -> None:
     images.end()
 
 
-def _confirm(fragment: Any, _t_s: float, _evidence: Any) -> None:
+def _confirm(fragment: Any, _t_s: float, _evidence: Any, *, only_by_place: bool = False) -> None:
     fragment.frames += 1
     fragment.join()
 
