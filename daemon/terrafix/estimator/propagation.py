@@ -1,6 +1,7 @@
 """From frame to frame: motion model, odometry, attitude and height become a new node of the graph and its factors."""
 
 import functools
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,7 @@ from terrafix.estimator.graph.pose_graph import NewNode
 from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffDetector, continue_from, start_at
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
-from terrafix.estimator.integrity.signed_innovations import SignedInnovations
+from terrafix.estimator.integrity.signed_innovations import RUN_SIZE, SignedInnovations
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning, DeadReckoningAid
@@ -82,6 +83,15 @@ class _RefusedMotion:
     inertial: bool
 
 
+@dataclass(frozen=True)
+class _Motion:
+    """V (8,) at ``t_s``, with covariance (8, 8)."""
+
+    t_s: float
+    motion: np.ndarray
+    cov: np.ndarray
+
+
 class Propagation:
     """``advance`` with every frame, in order of time.
 
@@ -97,6 +107,7 @@ class Propagation:
         self._height_gate, self._heading_gate = InnovationGate("height"), InnovationGate("attitude")
         self._motion_refused: _RefusedMotion | None = None
         self._signed = SignedInnovations()  # of odometry that is fused
+        self._before = deque[_Motion](maxlen=RUN_SIZE)  # what each of these was predicted from, the newest first
 
     def advance(self, frame: FrameInput) -> PropagationResult:
         """A new node for ``frame``, or a new graph that begins with it."""
@@ -158,18 +169,20 @@ class Propagation:
             p_m, motion = increment.predict(p_m, before.motion, float(before.calibration[HEADING]))
         return PredictedFrame(frame, before, odometry, increment, p_m, motion, cov)
 
-    def _increment(self, frame: FrameInput, before: NodeState, *, fused: bool) -> MotionIncrement:
-        """Increment of the motion model, from ``before``, the newest node, to ``frame``. ``fused``: odometry
-        enters the graph."""
+    def _increment(
+        self, frame: FrameInput, before: NodeState, *, fused: bool, from_s: float | None = None
+    ) -> MotionIncrement:
+        """Increment of the motion model, from ``before``, the newest node, to ``frame``; of its motion since an earlier
+        ``from_s``, if that is given. ``fused``: odometry enters the graph."""
         state, attitude = self._state, frame.attitude
-        from_s = state.graph.time_of(state.graph.newest)
+        from_s = state.graph.time_of(state.graph.newest) if from_s is None else from_s
         measured = frame.imu(round(from_s * 1e9), round(frame.t_s * 1e9))
         r_w_c = before.pose.rotation().matrix()
         yaws = tuple(
             state.camera.yaw_rad(r) for r in (r_w_c, state.camera.expected(attitude, before.calibration, r_w_c))
         )
         return integrate_motion(
-            state.graph.since_newest_s(frame.t_s),
+            frame.t_s - from_s,
             measured,
             (yaws[0], yaws[1]),
             float(before.calibration[HEADING]),
@@ -204,7 +217,7 @@ class Propagation:
             else:
                 state.contradicted_images.end()
             return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=not inertial)
-        if self._is_velocity_wrong(odometry) and predicted.increment is not None:
+        if self._is_velocity_wrong(predicted) and predicted.increment is not None:
             return self._reset_velocity(predicted, verdicts)
         if (off_mps := self._start_off_mps(predicted)) is not None:
             return self._leave_start(predicted, off_mps, verdicts)
@@ -220,22 +233,27 @@ class Propagation:
 
     def _reset_velocity(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
         """A new graph where odometry has been to one side of the prediction for frames. Either of the two is wrong. The
-        inertial readings of a prediction are believed, as far as the images may be right, until a place confirms
-        these; without such readings velocity is unknown."""
-        innovation, cov = predicted.odometry.motion_innovation, predicted.cov.copy()
+        velocity before these frames, and inertial readings since, are believed, as far as the images may be right,
+        until places confirm these; without such readings velocity is unknown."""
+        innovation, cov, motion = predicted.odometry.motion_innovation, predicted.cov.copy(), predicted.motion
         assert innovation is not None
-        off_m = self._signed.sum_m
+        off_m, before = self._signed.sum_m, self._before[self._signed.run - 1]
         cov[HORIZONTAL, HORIZONTAL] += np.outer(off_m, off_m)
         if innovation.inertial:
-            off_mps = self._signed.largest_m / innovation.dt_s
-            cov[DELTA_V, DELTA_V][HORIZONTAL, HORIZONTAL] += np.outer(off_mps, off_mps)
+            since = self._increment(predicted.frame, predicted.before, fused=False, from_s=before.t_s)
+            _, motion = since.predict(predicted.p_m, before.motion, float(predicted.before.calibration[HEADING]))
+            cov[DELTA_MOTION, DELTA_MOTION] = predict_covariance(since, before.cov)[DELTA_MOTION, DELTA_MOTION]
+            off_mps = (predicted.motion - motion)[VELOCITY]
+            cov[DELTA_V, DELTA_V] += np.outer(off_mps, off_mps)
             self._state.contradicted_images.begin()
         else:
             cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
         self._signed.forget()
+        self._before.clear()
         detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
         reset = _reset_verdict(ResetReason.VELOCITY, detail)
-        return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=not innovation.inertial)
+        predicted = replace(predicted, cov=cov, motion=motion)
+        return self._continue(predicted, [*verdicts, reset], confirmed=not innovation.inertial)
 
     def _start_off_mps(self, predicted: PredictedFrame) -> np.ndarray | None:
         if self._state.last_fix_s is not None:  # the map tells where it started
@@ -440,13 +458,15 @@ class Propagation:
         innovation = height_innovation(self._state, attitude.agl_m, registered.p_m, predicted.before, climb_m2)
         return self._height_gate.rejection(innovation, self._state.last_fix_s)
 
-    def _is_velocity_wrong(self, odometry: GatedOdometry) -> bool:
+    def _is_velocity_wrong(self, predicted: PredictedFrame) -> bool:
         """Whether the innovations of odometry have kept one sign for so long that velocity is what is wrong."""
+        odometry, graph = predicted.odometry, self._state.graph
         innovation = odometry.motion_innovation
         if odometry.fused is None or innovation is None or odometry.begins_disconnected:
             return False
         cov_m2 = innovation.cov_m2[HORIZONTAL, HORIZONTAL]
         self._signed.add(innovation.residual_m[HORIZONTAL], cov_m2, inertial=innovation.inertial)
+        self._before.appendleft(_Motion(graph.time_of(graph.newest), predicted.before.motion, self._state.motion_cov))
         return self._signed.alarm
 
     def _note_refused_motion(self, odometry: GatedOdometry, t_s: float) -> None:

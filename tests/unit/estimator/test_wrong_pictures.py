@@ -14,6 +14,8 @@ from overloaded_flight import OverloadedResult as LoadedFlown
 from seeds import seeds
 from simulated_flight import PLACE, EstimatorRun
 from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
+from terrafix.estimator import propagation
+from terrafix.estimator.integrity.signed_innovations import SignedInnovations
 from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
 from terrafix.messages import (
     CalibrationFault,
@@ -28,6 +30,7 @@ from terrafix.messages import (
 )
 from terrafix_lab.sim.true_messages import first_odometry
 
+LED, SHIFT_MPS = 5, 10.0  # images that are believed before the alarm
 SECONDS, FIRST, END = 25, 50, 100  # frames of the fault: 10 to 20 s
 KEYFRAME_EVERY = 5
 JITTER = 0.4 / 560.0  # 0.4 px
@@ -234,3 +237,32 @@ def test_images_that_are_squeezed_in_flight_contradict_inertial_readings(seed: i
     assert (faults[0].quantity, faults[0].t_ns) == ("picture contradicts motion", resets[0].t_ns)
     assert result.contradicted >= set(range(resets[0].frame_id, END))
     assert result.is_back(3.0)
+
+
+def test_inertial_readings_go_on_from_the_velocity_before_the_images_that_contradict_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """That velocity is shifted by 10 m/s, to be recognised; the claim contains that of the images, too."""
+    add, led, motion = SignedInnovations.add, list[int](), propagation._Motion
+
+    def counted(odometry: Odometry, rng: np.random.Generator) -> Odometry:
+        seen.append(odometry.frame_id)
+        return squeezed(odometry, rng)
+
+    def alarm_after(signed: SignedInnovations, *args: np.ndarray, inertial: bool) -> None:
+        add(signed, *args, inertial=inertial)
+        led.extend(seen[-1:])
+        signed.alarm, signed.run = len(led) == LED, LED
+
+    def shifted(t_s: float, v: np.ndarray, cov: np.ndarray) -> object:
+        return motion(t_s, v + np.eye(len(v))[0] * SHIFT_MPS, cov)
+
+    seen = list[int]()
+    monkeypatch.setattr(SignedInnovations, "add", alarm_after)
+    monkeypatch.setattr(propagation, "_Motion", shifted)
+    result = flown(1, counted, lambda _: None, FIRST + 12)
+    after = {e.frame_id: (e, off) for (e, _), off in zip(result.estimates, result.velocity_off_mps, strict=True)}
+    assert after[led[LED - 2]][1] < 0.2 * SHIFT_MPS
+    estimate, off_mps = after[led[LED - 1]]
+    assert off_mps == pytest.approx(SHIFT_MPS, rel=0.2)
+    assert estimate.velocity_sigma_mps == pytest.approx(SHIFT_MPS, rel=0.2)

@@ -26,9 +26,10 @@ from importlib import import_module
 from terrafix_lab.ablation.mechanisms import MECHANISMS
 for mechanism in MECHANISMS.values():
     owner = getattr(import_module(mechanism.module), mechanism.owner)
-    called = {name: inspect.signature(getattr(owner, name)) for name in mechanism.members if callable(getattr(owner, name))}
+    called = {name: getattr(owner, name) for name in mechanism.members if callable(getattr(owner, name))}
     mechanism.replace()
-    for name, signature in called.items():
+    for name, original in called.items():
+        signature = inspect.signature(original)
         keywords = {p.name: 0 for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY}
         inspect.signature(getattr(owner, name)).bind(*[0] * (len(signature.parameters) - len(keywords)), **keywords)
 """

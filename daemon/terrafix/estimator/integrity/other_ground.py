@@ -18,7 +18,7 @@ from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.monitors.registration import REGISTRATION_SPACING_HEIGHTS
 
 OFFSET_MEMORY = 0.7  # weight of the earlier mean in that of the squared offsets of rejected poses [tuned]
-# Distance of a wrong pose from the place, in heights, before any was rejected: within the image. [tuned]
+# Distance of a wrong pose from the place, in heights, before any was rejected [spec: half of a view of 70 degrees]
 WRONG_POSE_HEIGHTS = 0.7
 
 

@@ -26,9 +26,8 @@ MAX_SIGMAS = math.sqrt(GATE[3])  # of an innovation that counts; a larger one is
 
 
 class SignedInnovations:
-    """``sum_m`` (2,): of the innovations of the most likely run, east and north: as far as the estimate has followed
-    it; ``largest_m`` (2,): of one of them. ``alarm``: whether the run is too long, or too far to one side, to be
-    noise."""
+    """``run``: innovations of the most likely run; ``sum_m`` (2,): of these, east and north: as far as the estimate has
+    followed it. ``alarm``: whether the run is too long, or too far to one side, to be noise."""
 
     def __init__(self) -> None:
         self._residuals_m: deque[np.ndarray] = deque(maxlen=RUN_SIZE)
@@ -36,7 +35,7 @@ class SignedInnovations:
         self._variance, self._updates = 1.0, FIRST_GUESS  # of a claimed one, as learnt, and what it rests on
         # Under the hypothesis of no shift each run exceeds t nats with probability exp(-t) (chi-square, two degrees).
         self._limit = math.log(INNOVATIONS_PER_HOUR * INNOVATION_FALSE_ALARM_HOURS * INDEPENDENT_RUNS)
-        self.sum_m, self.largest_m, self.alarm = np.zeros(2), np.zeros(2), False
+        self.run, self.sum_m, self.alarm = 0, np.zeros(2), False
 
     def forget(self) -> None:
         """The run has ended; what is learnt stays."""
@@ -58,8 +57,6 @@ class SignedInnovations:
         counts = np.arange(1, len(self._standardised) + 1)
         sums = np.cumsum(np.array(self._standardised), axis=0)
         nats = np.where(counts < MIN_RUN, 0.0, 0.5 * np.sum(sums**2, axis=1) / counts)
-        run = int(np.argmax(nats)) + 1
-        residuals_m = np.array(self._residuals_m)[:run]
-        self.sum_m = residuals_m.sum(axis=0)
-        self.largest_m = residuals_m[np.argmax(np.hypot(*residuals_m.T))]
-        self.alarm = bool(nats[run - 1] > self._limit)
+        self.run = int(np.argmax(nats)) + 1
+        self.sum_m = np.array(self._residuals_m)[: self.run].sum(axis=0)
+        self.alarm = bool(nats[self.run - 1] > self._limit)
