@@ -26,7 +26,6 @@ OWNERS = {
         "terrafix.smoother",
         "terrafix_tools.finalise",
         "terrafix_lab.bench.growth.estimator_cost",
-        "terrafix_lab.bench.growth.merging_baseline",
     ),
     "pymavlink": (
         "terrafix.link",
