@@ -11,7 +11,7 @@ from rasterio.warp import transform
 
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.log_lines import MessageLog
-from terrafix.core.node import Node, NodeContext
+from terrafix.core.node import Node, NodeBase, NodeContext
 from terrafix.link.node import LinkNode
 from terrafix.messages import HintVerdict, Message, NavEstimate, PositionHint, StatusText, Verdict
 from terrafix_tools.evaluate import evaluate
@@ -69,7 +69,7 @@ def write_map_with_a_gap(source: Path, out: Path, places: list[tuple[float, floa
         dst.write(image)
 
 
-class AskedOperator:
+class AskedOperator(NodeBase):
     """The link, ticked at each estimate, and an operator who answers a request with the true position, roughly."""
 
     def __init__(self, truth: list[tuple[float, float]]) -> None:
@@ -87,9 +87,6 @@ class AskedOperator:
                 if isinstance(answer, StatusText) and "hint" in answer.text:
                     self.asked.append((message.frame_id, answer))
                     yield self._hint(message)
-
-    def tick(self, now_ns: int) -> Iterable[Message]:
-        return ()
 
     def _hint(self, estimate: NavEstimate) -> PositionHint:
         lat_deg, lon_deg = self._truth[EVERY * estimate.frame_id]

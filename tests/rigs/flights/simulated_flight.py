@@ -6,6 +6,7 @@ distribution that its message states."""
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame, rot_w_b
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.node import EstimatorNode
+from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, load_checkpoint
 from terrafix.messages import (
     Camera,
     MapMatch,
@@ -186,6 +188,13 @@ class EstimatorRun:
         for i in range(first, end):
             self.feed(altered(flight.messages(i), alter or unaltered))
         return self
+
+    def checkpoint(self, flight: Flight, killed: int, folder: Path) -> EstimatorCheckpoint | None:
+        """-> the last one of an estimator that was killed at the frame ``killed``, through the file."""
+        keeper = CheckpointWriter(file := folder / "estimator.checkpoint")
+        for message in [flight.fix(killed - 2), *self.fly(flight, 0, killed).published]:
+            keeper.on_message(message)
+        return load_checkpoint(file)
 
     def estimates(self) -> list[NavEstimate]:
         """-> the last published estimate of each frame, in their order."""

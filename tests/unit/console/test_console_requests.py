@@ -89,9 +89,9 @@ def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
         ({"name": "x" * 101}, "name"),
         ({"height_m": "high"}, "height_m"),
         ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}]}}, "no map sources"),
-        # 1 degree is 111.32 km: (111.32 + 19) * 19
+        # 2 degrees at 60 are 111.32 km: (111.32 + 19) * 19
         (
-            {"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}], "corridor_m": 9500}},
+            {"map": None, "area": {"waypoints": [{"lat": 60, "lon": 0}, {"lat": 60, "lon": 2}], "corridor_m": 9500}},
             "2476 km2",
         ),
     ],
