@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -30,13 +29,6 @@ from terrafix_tools.console.settings import ServiceLimits
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import FILE
 from terrafix_tools.installation import install_command
-
-
-@pytest.fixture(scope="module")
-def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
-    with Console(settings(tmp_path_factory.mktemp("console"))) as running:
-        yield running
-
 
 FORM = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
 
