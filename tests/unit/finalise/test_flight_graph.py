@@ -22,8 +22,8 @@ from terrafix.messages import MapMatch, Message, SearchResult, Verdict
 from terrafix.smoother.gnc import solve
 from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
-from terrafix_tools.finalise.fix_consistency import lost_sigma
-from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer
+from terrafix_tools.finalise.fix_consistency import information_shares, lost_sigma
+from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer, RecordedNode
 from terrafix_tools.finalise.submaps import _moved, _submap
 from terrafix_tools.score import nees_of
 
@@ -99,6 +99,18 @@ def test_only_a_map_match_that_nothing_contradicted_ends_the_doubt_of_the_nodes_
     inliers, begins = np.ones(2, bool), np.zeros(8, int)
     assert lost_sigma(flight, inliers, begins).tolist() == [0.0] * 3 + [800.0] * 5
     assert lost_sigma(flight, np.array([False, True]), begins).tolist() == [800.0] * 8
+
+
+def test_how_much_ground_two_map_matches_share_depends_on_the_height_above_it() -> None:
+    shares = []
+    for ground_m in (0.0, 500.0):
+        flight = FlightGraph(msgspec.structs.replace(ORIGIN, ground_amsl_m=ground_m))
+        for i in range(4):
+            pose = gtsam.Pose3(gtsam.Rot3(), np.array([40.0 * i, 0.0, ground_m + 100.0]))
+            flight.recorder.nodes.append(RecordedNode(float(i), NodeState(pose, np.zeros(6), np.zeros(8)), []))
+            flight.fixes.append(Fix(i, pose, np.eye(6), 1.0, False, np.zeros((6, 2)), 0.0, True, None))
+        shares.append(information_shares(flight))
+    assert shares[0] == shares[1] and shares[0][0] == 1.0 > shares[0][1]
 
 
 def test_map_matches_over_the_same_ground_count_with_their_share(monkeypatch: pytest.MonkeyPatch) -> None:
