@@ -1,6 +1,7 @@
 """Batch smoother after landing: accuracy, consistency, and rejection of outlier map matches."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import gtsam
@@ -13,6 +14,7 @@ from map_matches import with_search
 from recorded_flight import blind_between, errors, replayed_graph, shifted, unmatched
 from simulated_flight import ORIGIN, EstimatorRun, Flight, error_m
 from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.map_error import shared_variance_m2
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.estimator.models.lens_prior import principal_point_sigma
@@ -24,6 +26,7 @@ from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.fix_consistency import information_shares, lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer, RecordedNode
+from terrafix_tools.finalise.run import refined_track
 from terrafix_tools.finalise.submaps import _moved, _submap
 from terrafix_tools.score import nees_of
 
@@ -158,6 +161,15 @@ def test_a_segment_that_is_moved_turns_its_velocity_and_not_what_is_in_the_axes_
     state = NodeState(gtsam.Pose3(), np.zeros(6), np.array([10.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.1, 0.2]))
     moved = _moved(state, gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2.0), np.ones(3)))
     assert moved.motion == pytest.approx([0.0, 10.0, 1.0, 2.0, 0.0, 0.0, 0.1, 0.2])
+
+
+def test_positions_that_the_estimator_refines_have_the_error_of_the_map_on_earth() -> None:
+    graph, turned = replayed_graph(Flight(3, seed=4)), gtsam.Rot3.Rz(0.5).matrix()
+    past = SimpleNamespace(r_w_c=turned, p_m=np.zeros(3), cov=np.diag([4.0, 4.0, 9.0, 0.01, 0.01, 0.01]))
+    estimator: Any = SimpleNamespace(map_sigma_m=5.0, refine=lambda: {0: past, 99: past})
+    ((frame_id, placed),) = refined_track(graph, estimator).items()
+    variances = np.diag(tangent_to_world(placed.cov, turned))
+    assert frame_id == 0 and variances[:3] == pytest.approx([4.0 + shared_variance_m2(5.0)] * 2 + [9.0])
 
 
 def test_the_height_over_sloping_ground_follows_its_keyframe(monkeypatch: pytest.MonkeyPatch) -> None:
