@@ -31,7 +31,8 @@ from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
 from terrafix_tools.mapping.choices import Descriptors
-from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
+from terrafix_tools.mapping.imagery import Imagery
+from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
 from terrafix_tools.mapping.mosaic.accuracy import add_accuracy_estimates
 from terrafix_tools.mapping.mosaic.collar import find_collar
 from terrafix_tools.mapping.package.dem import TILES_PER_WORKER, DemSource, height_places, open_heights, write_elevation
