@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from source_folders import some_frames
 from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.pnp import solved
@@ -57,7 +58,7 @@ def fly(data_set: DataSet, tmp_path_factory: pytest.TempPathFactory) -> Fly:
         flight, map_path = data_set(f"flights/{name}"), data_set(f"maps/{map_name}")
         options = ["--model", f"{model}={data_set(f'models/{model}.onnx')}"] if model else []
         folder = tmp_path_factory.mktemp(name)
-        flight = short_flight(flight, folder / "flight", frames)
+        flight = some_frames(flight, folder / "flight", slice(frames))
         command = [sys.executable, "-m", "terrafix_tools.program", "replay", str(flight), "--map", str(map_path)]
         done = subprocess.run(
             [*command, "--out", str(folder / "out"), "--quiet", *options], stderr=subprocess.PIPE, text=True
@@ -74,17 +75,6 @@ def fly(data_set: DataSet, tmp_path_factory: pytest.TempPathFactory) -> Fly:
 
 def rows_of(out: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((out / "estimates.csv").read_text(encoding="utf-8").splitlines()))
-
-
-def short_flight(flight: Path, folder: Path, frames: int) -> Path:
-    """-> a new flight folder with the first frames of a flight."""
-    folder.mkdir()
-    for entry in flight.iterdir():
-        if entry.name != "frames.csv":
-            (folder / entry.name).symlink_to(entry.resolve())
-    lines = (flight / "frames.csv").read_text(encoding="utf-8").splitlines()
-    (folder / "frames.csv").write_text("\n".join(lines[: frames + 1]) + "\n", encoding="utf-8")
-    return folder
 
 
 def errors_m(flight: Path, rows: list[dict[str, str]], prefix: str = "") -> np.ndarray:

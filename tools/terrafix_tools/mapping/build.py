@@ -29,6 +29,7 @@ from terrafix.map.format import (
 )
 from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
+from terrafix_engines.store import sha256_of
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
 from terrafix_tools.mapping.choices import Descriptors
 from terrafix_tools.mapping.imagery import Imagery
@@ -54,8 +55,6 @@ from terrafix_tools.parallel.pool import (
     render_pieces,
 )
 from terrafix_tools.progress import Bar, progress_bar
-
-HASH_CHUNK = 1 << 20
 
 
 def build(
@@ -85,7 +84,7 @@ def layer_of(imagery: Path, *, date: str = "", licence: str = "", ce90_m: float 
     return LayerInput(
         open=partial(ImagerySource, imagery.absolute()),  # a worker may have another working directory
         source=imagery.name,
-        source_sha256=_sha256(imagery),
+        source_sha256=sha256_of(imagery),
         where=str(imagery),
         date=date,
         licence=licence,
@@ -315,11 +314,3 @@ def _count_steps(pieces: Generator[Piece, None, None], step: Callable[[], None])
         for piece in pieces:
             step()
             yield piece
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(HASH_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
