@@ -8,9 +8,9 @@ import pytest
 
 from terrafix.core.gate import CHI2_95, GATE
 from terrafix.core.pose import exp_so3
-from terrafix.smoother.gnc import OutlierCandidate, solve
+from terrafix.smoother.gnc import OutlierCandidate, marginals, solve, weighted
 from terrafix.smoother.sim3_consensus import _Anchored, place
-from terrafix.smoother.sim3_pose_graph import merge
+from terrafix.smoother.sim3_pose_graph import Sim3PoseGraph, merge
 from terrafix.smoother.submap_types import AbsoluteConstraint, MergedSubmaps, RelativeConstraint, Submap
 from terrafix_lab.bench.growth.merging import STEP_SIGMAS, SubmapFlight, make_submap_flight, measure, pose_errors
 from terrafix_tools.score import nees_of
@@ -62,6 +62,18 @@ def test_the_limit_of_an_outlier_is_that_of_its_squared_distance(share: float, i
 
     _, inliers = solve(certain, [OutlierCandidate(factor(1.0), factor, GATE[6])], values)
     assert inliers.tolist() == [inlier]
+
+
+def test_an_outlier_is_readmitted_within_its_own_error_and_not_beyond() -> None:
+    flight = make_submap_flight(12, submaps=1, keyframes=40, scale_known=True, wrong_share=0.0)
+    graph = Sim3PoseGraph(flight.submaps, flight.anchors, [])
+    certain, values = graph._chains()
+    factors = [graph._anchor_factor(anchor) for anchor in flight.anchors]
+    found, seen = marginals(weighted(certain, factors, np.ones(len(factors))), values), values.atSimilarity3(0)
+    for aside_m, consistent in ((6.0, True), (30.0, False)):  # of a 1-sigma of 2 m, where the solution has less
+        at_m = seen.translation() + np.array([aside_m, 0.0, 0.0])
+        moved = replace(flight.anchors[0], r_w_c=seen.rotation().matrix(), p_c_in_w_m=at_m)
+        assert graph._consistent(moved, values, found) is consistent
 
 
 def test_what_supports_a_place_does_not_depend_on_the_unit_of_the_submap() -> None:
