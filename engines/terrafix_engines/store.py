@@ -12,7 +12,6 @@ from terrafix_engines.providers import PREFERENCE
 from terrafix_engines.runtime import Model, ModelFileError
 
 ENGINES = "engines"  # subfolder of the models folder
-_BLOCK_BYTES = 1 << 20
 
 
 def models_folder(chosen: str = "") -> Path:
@@ -102,8 +101,5 @@ def resolve_model(text: str, slot: str, folder: Path) -> StoredModel | Path:
 
 def sha256_of(path: Path) -> str:
     """Hex digest of a file. Raises OSError."""
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -9,9 +9,10 @@ import pytest
 import rasterio
 from rasterio.warp import transform
 
+from source_folders import some_frames
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.log_lines import MessageLog
-from terrafix.core.node import Node, NodeContext
+from terrafix.core.node import Node, NodeBase, NodeContext
 from terrafix.link.node import LinkNode
 from terrafix.messages import HintVerdict, Message, NavEstimate, PositionHint, StatusText, Verdict
 from terrafix_tools.evaluate import evaluate
@@ -44,17 +45,6 @@ def errors_m(rows: list[dict[str, str]], truth: list[tuple[float, float]]) -> np
     return np.array([LocalFrame(*true).to_local(*at) for at, true in zip(places, truth[:FRAMES:EVERY], strict=True)])
 
 
-def thinned_flight(flight: Path, folder: Path) -> Path:
-    """-> a new flight folder with every ``EVERY``-th of the first ``FRAMES`` frames of a flight."""
-    folder.mkdir()
-    for entry in flight.iterdir():
-        if entry.name != "frames.csv":
-            (folder / entry.name).symlink_to(entry.resolve())
-    header, *rows = (flight / "frames.csv").read_text(encoding="utf-8").splitlines()
-    (folder / "frames.csv").write_text("\n".join([header, *rows[:FRAMES:EVERY]]) + "\n", encoding="utf-8")
-    return folder
-
-
 def write_map_with_a_gap(source: Path, out: Path, places: list[tuple[float, float]]) -> None:
     """Copies a map without its imagery within ``BLANK_M`` of ``places``."""
     with rasterio.open(source) as src:
@@ -69,7 +59,7 @@ def write_map_with_a_gap(source: Path, out: Path, places: list[tuple[float, floa
         dst.write(image)
 
 
-class AskedOperator:
+class AskedOperator(NodeBase):
     """The link, ticked at each estimate, and an operator who answers a request with the true position, roughly."""
 
     def __init__(self, truth: list[tuple[float, float]]) -> None:
@@ -87,9 +77,6 @@ class AskedOperator:
                 if isinstance(answer, StatusText) and "hint" in answer.text:
                     self.asked.append((message.frame_id, answer))
                     yield self._hint(message)
-
-    def tick(self, now_ns: int) -> Iterable[Message]:
-        return ()
 
     def _hint(self, estimate: NavEstimate) -> PositionHint:
         lat_deg, lon_deg = self._truth[EVERY * estimate.frame_id]
@@ -114,7 +101,12 @@ def test_after_a_fifth_of_the_route_without_a_fix_the_operator_is_asked_and_the_
     def nodes(ctx: NodeContext) -> Mapping[str, Node]:
         return {**make_nodes(ctx), "link": operator}
 
-    replay(thinned_flight(flight, tmp_path / "flight"), tmp_path / "map.tif", tmp_path / "out", nodes=nodes)
+    replay(
+        some_frames(flight, tmp_path / "flight", slice(0, FRAMES, EVERY)),
+        tmp_path / "map.tif",
+        tmp_path / "out",
+        nodes=nodes,
+    )
     rows = list(csv.DictReader((tmp_path / "out" / "estimates.csv").read_text(encoding="utf-8").splitlines()))
     fixed = [i for i, row in enumerate(rows) if row["anchor_age_ms"] == "0"]
     last_before = max(i for i in fixed if i < BLANK[0] // EVERY)

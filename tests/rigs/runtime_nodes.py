@@ -14,7 +14,7 @@ from origins import origin_of
 from terrafix import messages as m
 from terrafix.core.errors import LinkError
 from terrafix.core.frames import FrameWriter
-from terrafix.core.node import Edge, Node, NodeContext
+from terrafix.core.node import Edge, Node, NodeBase, NodeContext
 from terrafix.processes import ALL_MESSAGES, Process
 
 CAMERA = m.Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
@@ -43,14 +43,6 @@ def prediction(frame_id: int, east_m: float, north_m: float) -> m.Prediction:
 
 def image_of(frame_id: int) -> np.ndarray:
     return np.full((48, 64, 3), frame_id % 251, np.uint8)
-
-
-class SilentNode:
-    def on(self, message: m.Message) -> Iterable[m.Message]:
-        return ()
-
-    def tick(self, now_ns: int) -> Iterable[m.Message]:
-        return ()
 
 
 class SourceEdge:
@@ -85,7 +77,7 @@ class SourceEdge:
         pass
 
 
-class Worker(SilentNode):
+class Worker(NodeBase):
     """Publishes for every frame whether it has the origin and the correct pixels. The environment variable ``TROUBLE``
     makes it fail once."""
 
@@ -122,11 +114,15 @@ class Worker(SilentNode):
         raise ZeroDivisionError("a bug for the test")
 
 
-class Link(SilentNode):
+def status(now_ns: int) -> m.LinkStatus:
+    return m.LinkStatus(
+        t_ns=now_ns, connected=True, autopilot="none", sysid=1, sent=0, received=0, bad=0, time_offset_ms=None
+    )
+
+
+class Link(NodeBase):
     def tick(self, now_ns: int) -> Iterable[m.Message]:
-        yield m.LinkStatus(
-            t_ns=now_ns, connected=True, autopilot="none", sysid=1, sent=0, received=0, bad=0, time_offset_ms=None
-        )
+        yield status(now_ns)
 
 
 class FileEdge:
@@ -151,7 +147,7 @@ def make_node(ctx: NodeContext) -> Node:
         raise ZeroDivisionError("a bug at every start")
     if role == "link" and ctx.config.link.device == "broken":
         raise LinkError("broken: no such device; check --link")
-    return {"estimator": lambda: Worker(ctx), "link": Link}.get(role, SilentNode)()
+    return {"estimator": lambda: Worker(ctx), "link": Link}.get(role, NodeBase)()
 
 
 def make_edge(ctx: NodeContext) -> Edge | None:

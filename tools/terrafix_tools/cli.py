@@ -31,6 +31,8 @@ EXTRAS = {
     ),
     "ground": ("rasterio", "urllib3", "pmtiles", "osmium", "pyogrio", "pyarrow", "pyulog", "yaml", "terrafix_"),
     "rosbag": ("rosbags",),
+    "fleet": ("duckdb",),
+    "sim": ("mavsdk",),
 }  # fmt: skip
 # a full disk, or one over its quota
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)

@@ -16,7 +16,7 @@ from terrafix.core.allocator import return_excess_memory
 from terrafix.core.config import HealthSection
 from terrafix.core.errors import ModelError, TerrafixError
 from terrafix.core.geodesy import LocalFrame
-from terrafix.core.node import FrameStore, NodeContext
+from terrafix.core.node import FrameStore, NodeBase, NodeContext
 from terrafix.core.signature import trusted_keys
 from terrafix.map.package import MapPackage
 from terrafix.messages import (
@@ -46,7 +46,7 @@ from terrafix_engines.runtime import ModelFileError, ModelRunError
 MAX_PLACES = 5  # of a search that are published [spec: SV-5 of the requirements]
 
 
-class AnchorNode:
+class AnchorNode(NodeBase):
     def __init__(
         self,
         frames: FrameStore,
@@ -97,9 +97,6 @@ class AnchorNode:
                 yield from self._on_prediction(message)
             case _:
                 pass
-
-    def tick(self, now_ns: int) -> Iterable[Message]:
-        return ()
 
     def _on_prediction(self, prediction: Prediction) -> Iterable[Message]:
         if prediction.prior_t_ns > self._prior_t_ns:  # the belief refers to another position

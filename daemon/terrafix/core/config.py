@@ -16,7 +16,6 @@ from terrafix.core.errors import ConfigError
 from terrafix.core.passwords import without_password
 from terrafix.core.toml_file import read_toml
 
-Positive = Annotated[float, Meta(gt=0)]
 OutputName = Literal["gps_input", "odometry", "vision_position", "external_position", "global_position"]
 GnssMode = Literal["off", "advise", "act"]
 RecordedFrames = Literal["none", "thumbnails", "keyframes", "all"]

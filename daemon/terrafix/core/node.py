@@ -45,6 +45,16 @@ class Node(Protocol):
         """Called at the tick rate of the process table; ``now_ns`` is the monotonic time of the shell."""
 
 
+class NodeBase:
+    """A node without a reaction; those that only messages drive have no tick of their own."""
+
+    def on(self, message: Message) -> Iterable[Message]:
+        return ()
+
+    def tick(self, now_ns: int) -> Iterable[Message]:
+        return ()
+
+
 class Edge(Protocol):
     """The input and output of a process (camera, serial port, MCAP file).
 

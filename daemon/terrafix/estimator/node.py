@@ -12,7 +12,7 @@ from terrafix.core.camera import Mount
 from terrafix.core.geodesy import LocalFrame
 from terrafix.core.initial_position import with_initial_position
 from terrafix.core.limits import MIN_MATCHING_AGL_M
-from terrafix.core.node import Edge, NodeContext
+from terrafix.core.node import Edge, NodeBase, NodeContext
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.claim import Claim
 from terrafix.estimator.edge import EstimatorEdge
@@ -83,7 +83,7 @@ BEFORE_TELEMETRY = "older than the autopilot's first messages after the restart"
 MakeEstimator = Callable[[Origin, NavPrior | None], Estimator]
 
 
-class EstimatorNode:
+class EstimatorNode(NodeBase):
     """Node of the estimator: odometry, telemetry and map matches in; estimates, predictions and verdicts out."""
 
     def __init__(
@@ -167,9 +167,6 @@ class EstimatorNode:
     def on(self, message: Message) -> Iterable[Message]:
         handler = self._handlers.get(type(message))
         return () if handler is None else handler(message)
-
-    def tick(self, now_ns: int) -> Iterable[Message]:
-        return ()
 
     # --- flight and start ----------------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 from terrafix.core.config import HealthSection
 from terrafix.core.errors import ConfigError
-from terrafix.core.node import Edge, NodeContext
+from terrafix.core.node import Edge, NodeBase, NodeContext
 from terrafix.health.power import most_limited, whole_computer_w
 from terrafix.health.sysfs import HealthEdge
 from terrafix.health.zones import DecidingZones
@@ -14,7 +14,7 @@ from terrafix.messages import Health, Message, TemperatureZone, ThermalBand, The
 _RANK = {ThermalBand.NORMAL: 0, ThermalBand.HOT: 1, ThermalBand.CRITICAL: 2}
 
 
-class HealthNode:
+class HealthNode(NodeBase):
     """ThermalReading in, Health out. A band is entered at its limit and left ``hysteresis_c`` below it, so that it does
     not oscillate.
 
@@ -35,9 +35,6 @@ class HealthNode:
     def on(self, message: Message) -> Iterable[Message]:
         if isinstance(message, ThermalReading):
             yield self._health(message)
-
-    def tick(self, now_ns: int) -> Iterable[Message]:
-        return ()
 
     def _health(self, reading: ThermalReading) -> Health:
         """Band by temperature; at least HOT while a processor is throttled."""

@@ -5,7 +5,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterable
 
-from terrafix.core.node import Edge, FrameStore, Node, NodeContext
+from terrafix.core.node import Edge, FrameStore, Node, NodeBase, NodeContext
 from terrafix.messages import Dropped, Frame, Message
 from terrafix.recorder.images import ImagePolicy
 from terrafix.recorder.provenance import header
@@ -14,16 +14,6 @@ from terrafix.recorder.segments import FRAME_IMAGE, SegmentRing
 RECORD_QUEUE_LENGTH = 8192  # about 30 s of all messages; a longer queue would only hide a disk that is too slow
 RECORD_FLUSH_S = 0.25  # interval of flushes: at most this much of the record is lost when the process is killed
 CLOSE_TIMEOUT_S = 10.0
-
-
-class RecorderNode:
-    """Does nothing: the edge writes the messages of the process."""
-
-    def on(self, message: Message) -> Iterable[Message]:
-        return ()
-
-    def tick(self, now_ns: int) -> Iterable[Message]:
-        return ()
 
 
 class RecorderEdge:
@@ -106,7 +96,7 @@ class RecorderEdge:
 
 
 def make_node(ctx: NodeContext) -> Node:
-    return RecorderNode()
+    return NodeBase()  # the edge writes the messages of the process
 
 
 def make_edge(ctx: NodeContext) -> Edge:

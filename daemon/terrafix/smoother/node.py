@@ -13,7 +13,7 @@ import numpy as np
 
 from terrafix.core.geodesy import LocalFrame, quat_from_rot, rot_from_quat
 from terrafix.core.map_error import shared_variance_m2
-from terrafix.core.node import NodeContext
+from terrafix.core.node import NodeBase, NodeContext
 from terrafix.core.pose import HORIZONTAL, tangent_to_world, world_to_tangent
 from terrafix.messages import (
     CovarianceMode,
@@ -42,7 +42,7 @@ KNOWN_HEIGHT_WALK, ASSUMED_HEIGHT_WALK = 0.002, 0.02  # [spec: of finalise]
 KNOWN_HEIGHT = 0.1  # 1-sigma of a known height, as a share [spec: docs/finalise.md]
 
 
-class SmootherNode:
+class SmootherNode(NodeBase):
     def __init__(self, *, enabled: bool = True, graph: KeyframeGraph | None = None) -> None:
         self._enabled = enabled
         self._graph = graph or KeyframeGraph()
@@ -76,9 +76,6 @@ class SmootherNode:
             self._waiting = [*self._waiting[-MAX_POSES:], message]
             return ()
         return self._take(message)
-
-    def tick(self, now_ns: int) -> Iterable[Message]:
-        return ()
 
     def _on_origin(self, origin: Origin) -> Iterable[Message]:
         axes = LocalFrame(origin.lat_deg, origin.lon_deg)

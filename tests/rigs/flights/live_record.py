@@ -18,11 +18,6 @@ LATE = 3  # messages by which the recorder receives telemetry later than the est
 MS = 1_000_000
 
 
-def handled(flight: Flight) -> list[Message]:
-    """-> the inputs of the estimator in the order in which it handles them."""
-    return [message for message in messages(flight) if isinstance(message, PROCESS.subscribes)]
-
-
 def write(
     path: Path, flight: Flight, *, restart_at: int | None = None, lost: frozenset[int] = frozenset(), order: bool = True
 ) -> list[Message]:

@@ -6,14 +6,17 @@ distribution that its message states."""
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from map_matches import plane
-from terrafix.core.camera import Mount
+from terrafix.core.camera import Mount, distort_division
 from terrafix.core.geodesy import LocalFrame, rot_w_b
 from terrafix.core.pose import exp_so3
 from terrafix.estimator.node import EstimatorNode
+from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, load_checkpoint
 from terrafix.messages import (
     Camera,
     MapMatch,
@@ -187,6 +190,13 @@ class EstimatorRun:
             self.feed(altered(flight.messages(i), alter or unaltered))
         return self
 
+    def checkpoint(self, flight: Flight, killed: int, folder: Path) -> EstimatorCheckpoint | None:
+        """-> the last one of an estimator that was killed at the frame ``killed``, through the file."""
+        keeper = CheckpointWriter(file := folder / "estimator.checkpoint")
+        for message in [flight.fix(killed - 2), *self.fly(flight, 0, killed).published]:
+            keeper.on_message(message)
+        return load_checkpoint(file)
+
     def estimates(self) -> list[NavEstimate]:
         """-> the last published estimate of each frame, in their order."""
         last = {m.frame_id: m for m in self.published if isinstance(m, NavEstimate)}
@@ -242,3 +252,11 @@ def blind(odometry: Message, verdict: Verdict = Verdict.FEW_INLIERS) -> Odometry
     """The odometry message of the same frame without tracked features."""
     assert isinstance(odometry, Odometry)
     return Odometry(t_ns=odometry.t_ns, frame_id=odometry.frame_id, keyframe_id=odometry.keyframe_id, verdict=verdict)
+
+
+def with_distortion(message: Message, k1: float) -> Message:
+    """The pairs of an Odometry as a lens with this radial coefficient shows them; other messages as they are."""
+    if not isinstance(message, Odometry) or not message.two_view:
+        return message
+    seen = [distort_division(np.array(message.two_view)[:, xy], k1) for xy in (slice(0, 2), slice(2, 4))]
+    return msgspec.structs.replace(message, two_view=[tuple(pair) for pair in np.hstack(seen).tolist()])

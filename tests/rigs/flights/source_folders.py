@@ -62,3 +62,14 @@ def flight(folder: Path, frames: int = 5, *, toml: str = TOML, csv: str | None =
     (folder / "flight.toml").write_text(toml)
     (folder / "frames.csv").write_text(csv if csv is not None else "\n".join([HEADER, *rows]) + "\n")
     return folder
+
+
+def some_frames(flight: Path, folder: Path, chosen: slice) -> Path:
+    """-> a new flight folder with the ``chosen`` frames of a flight."""
+    folder.mkdir()
+    for entry in flight.iterdir():
+        if entry.name != "frames.csv":
+            (folder / entry.name).symlink_to(entry.resolve())
+    header, *rows = (flight / "frames.csv").read_text(encoding="utf-8").splitlines()
+    (folder / "frames.csv").write_text("\n".join([header, *rows[chosen]]) + "\n", encoding="utf-8")
+    return folder

@@ -137,7 +137,6 @@ class Rig:
             roll_rad=0.0,
             baro_amsl_m=HEIGHT_M,
             airspeed_mps=self.airspeed + float(self._rng.normal(0.0, 0.2)) if self.kind is Kind.PLANE else None,
-            range_m=None,
             gnss=self._real_gps(self.t_s),
         )
 

@@ -15,6 +15,7 @@ from terrafix.core.errors import EvaluationError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.messages import Camera, Frame, Health, MapMatch, Message, Origin, Prediction, VehicleState, Verdict
 from terrafix.vision.sources import Shot
+from terrafix.vision.sources.contract import SourceBase
 from terrafix_lab.accept.false_inputs.maps import stale_along
 from terrafix_lab.accept.flight import AcceptFlight, FrameRef, read_any_truth
 from terrafix_lab.accept.long_route import ThereAndBack, original
@@ -33,13 +34,10 @@ ORIGIN = Origin(
 FRAMES = 12
 
 
-class Counting:
+class Counting(SourceBase):
     """A source whose picture number i is grey value i on the left and zero on the right."""
 
-    live = False
-
-    def origin(self) -> Origin:
-        return ORIGIN
+    _origin = ORIGIN
 
     def length(self) -> int | None:
         return FRAMES
@@ -53,14 +51,8 @@ class Counting:
                 frame = Frame(t_ns=i * 10**9, frame_id=i, file=f"{i}.jpg", width=8, height=4)
                 yield Shot(frame, (state,), image)
 
-    def map_hint(self) -> Path | None:
-        return None
-
     def name(self) -> str:
         return "counting"
-
-    def close(self) -> None:
-        pass
 
 
 def altered(edit: edits.Edit, **more: object) -> list[Shot]:

@@ -18,7 +18,7 @@ from flight_records import ORIGIN, estimate
 from source_folders import TOML, flight
 from terrafix import messages as m
 from terrafix.core.errors import ConfigError, MapError, ModelError, OutputError, UsageError
-from terrafix.core.node import Node, NodeContext
+from terrafix.core.node import Node, NodeBase, NodeContext
 from terrafix.map.package import MapPackage
 from terrafix.recorder.reader import ReadResult, read_flight, read_frame_images, read_thumbnails
 from terrafix.recorder.writer import FlightWriter
@@ -33,7 +33,7 @@ KEYFRAMES = [0, 3]
 LOST = 2  # the frame for which the stub estimator publishes no estimate
 
 
-class StubVision:
+class StubVision(NodeBase):
     def on(self, message: m.Message) -> Iterable[m.Message]:
         if isinstance(message, m.Frame):
             keyframe = max(0, message.frame_id - 1)
@@ -46,11 +46,8 @@ class StubVision:
                 becomes_keyframe=message.frame_id in KEYFRAMES,
             )
 
-    def tick(self, now_ns: int) -> Iterable[m.Message]:
-        return ()
 
-
-class StubEstimator:
+class StubEstimator(NodeBase):
     """Publishes two estimates per frame; the last one counts."""
 
     def __init__(self, die_at: int = -1) -> None:
@@ -86,9 +83,6 @@ class StubEstimator:
                     yield m.Refinement(t_ns=message.t_ns, poses=[pose])
             case _:
                 pass
-
-    def tick(self, now_ns: int) -> Iterable[m.Message]:
-        return ()
 
 
 def nodes(ctx: NodeContext) -> dict[str, Node]:
@@ -304,7 +298,7 @@ def test_replay_of_recorded_frames_gives_the_messages_of_the_replay(folder: Path
     assert summary["source"] == str(tmp_path / "a")
 
 
-class RunningSum:
+class RunningSum(NodeBase):
     """A stub estimator whose position is the sum of all heights that it has heard."""
 
     def __init__(self) -> None:
@@ -317,9 +311,6 @@ class RunningSum:
         elif isinstance(message, m.Odometry):
             self.heard.append(message.frame_id)
             yield estimate(message.frame_id, self._sum_m, 0.0)
-
-    def tick(self, now_ns: int) -> Iterable[m.Message]:
-        return ()
 
 
 class SeenFrames(StubVision):

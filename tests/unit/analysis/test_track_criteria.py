@@ -47,6 +47,7 @@ def test_several_flights_are_shown_as_the_worst_and_one_that_never_is_right_agai
 def test_the_time_to_notice_ends_at_the_last_false_position_after_the_beginning() -> None:
     assert track({5: 90.0, 13: 90.0}, fault=FAULT).notice_s() == pytest.approx(3.0)
     assert track({5: 90.0}, fault=FAULT).notice_s() is None and track({5: 90.0}).notice_s() is None
+    assert track({0: 90.0, 1: 90.0}).is_late().sum() == 2, "without a fault all are"
 
 
 def test_a_fault_is_reported_by_its_cause_and_named_by_the_verdict() -> None:

@@ -45,7 +45,7 @@ FLIGHT: dict[str, Any] = {
         "accuracy": accuracy(0.0),
     },
     "peers": {"XFeat": {"cpu_ms": None, "cpu_ms_with_map_points_kept": None, "accuracy": accuracy(0.5)}},
-    "missing": ["AKAZE: not there"],
+    "missing": ["XFeat: not there"],
     "floor": {
         "anchor": {
             "kernel_cpu_ms": spread(40.0),
@@ -91,7 +91,7 @@ def test_the_page_has_the_tables_the_picture_and_what_was_not_measured(tmp_path:
     assert text == page(RESULT)
     assert "| ... the map matching of it | 7/8 | 80/160/240 | - | 25 % |" in text
     assert "First frame 800 ms of the processor, start-up 1.5 s by the clock, 300 MB." in text
-    assert "Not measured: AKAZE: not there." in text and "Not measured: flight town-a: not there." in text
+    assert "Not measured: XFeat: not there." in text and "Not measured: flight town-a: not there." in text
     assert all(len(line) <= 160 or line.startswith("|") for line in text.splitlines())
     picture = ElementTree.parse(tmp_path / "docs" / "images" / "benchmark.svg").getroot()
     bars = [float(bar.get("width", "")) for bar in picture.iter("{http://www.w3.org/2000/svg}rect")][1:]

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +11,7 @@ from terrafix.core.errors import OutputError, SourceError, UsageError
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.messages import Prediction
 from terrafix_engines.features.keypoints import Keypoints, MutualNearestMatcher
-from terrafix_lab.bench.peers import AKAZE, LIGHTERGLUE, SIFT, XFEAT, ModelPoints, Peer, methods
+from terrafix_lab.bench.peers import LIGHTERGLUE, SIFT, XFEAT, ModelPoints, Peer, methods
 from terrafix_lab.bench.run import bench
 from textured_ground import PINHOLE, FlatMap, rotation, texture, view
 
@@ -107,7 +106,6 @@ def test_peers_without_weights_are_named_as_missing(tmp_path: Path) -> None:
     assert SIFT in found and XFEAT not in found
     for method, what in zip((XFEAT, LIGHTERGLUE), missing[-2:], strict=True):
         assert what.startswith(f"{method}: {tmp_path}") and "terrafix models fetch" in what
-    assert (AKAZE in found) == hasattr(cv2, "AKAZE_create")
 
 
 def test_points_of_a_model_outside_of_the_mask_are_left_out() -> None:

@@ -1,5 +1,6 @@
 """Requests to the console: what is taken, and what is refused with a problem that says why."""
 
+import asyncio
 import json
 import random
 import socket
@@ -9,7 +10,6 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,6 @@ from terrafix_tools.console.settings import ServiceLimits
 from terrafix_tools.console.store import flights
 from terrafix_tools.console.store.database import FILE
 from terrafix_tools.installation import install_command
-
-
-@pytest.fixture(scope="module")
-def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Console]:
-    with Console(settings(tmp_path_factory.mktemp("console"))) as running:
-        yield running
-
 
 FORM = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
 
@@ -88,9 +81,9 @@ def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
         ({"name": "x" * 101}, "name"),
         ({"height_m": "high"}, "height_m"),
         ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}]}}, "no map sources"),
-        # 1 degree is 111.32 km: (111.32 + 19) * 19
+        # 2 degrees at 60 are 111.32 km: (111.32 + 19) * 19
         (
-            {"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}], "corridor_m": 9500}},
+            {"map": None, "area": {"waypoints": [{"lat": 60, "lon": 0}, {"lat": 60, "lon": 2}], "corridor_m": 9500}},
             "2476 km2",
         ),
     ],
@@ -423,20 +416,26 @@ def test_a_flight_that_failed_is_tried_again_and_no_other(console: Console) -> N
         assert flights.image_of(db, flight_id, 3).attempts == 0
 
 
-def test_a_service_closes_its_database_after_its_processes_have_ended(
+def test_a_flight_is_given_up_after_deaths_in_a_row_without_a_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    order = []
-    with Console(settings(tmp_path)) as running:
-        end, close = running.service.workers.stop, running.service.database.close
+    failed: list[str] = []
 
-        async def ended() -> None:
-            await end()
-            order.append("processes")
+    async def nothing(*_: object) -> None: ...
 
-        monkeypatch.setattr(running.service.workers, "stop", ended)
-        monkeypatch.setattr(running.service.database, "close", lambda: (order.append("database"), close()))
-    assert order == ["processes", "database"]
+    async def fails(_flight_id: str, why: str) -> None:
+        failed.append(why)
+
+    async def die() -> None:
+        computing = workers.Workers(settings(tmp_path), workers.Reports(nothing, nothing, fails))
+        for stored in [0] * (workers.MAX_DEATHS - 1) + [1] + [0] * (workers.MAX_DEATHS - 2):
+            await computing._died("f", tmp_path, workers._Running(None, stored=stored), 1)  # type: ignore[arg-type]
+        assert failed == []
+        await computing._died("f", tmp_path, workers._Running(None), 1)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(workers, "RESTART_S", 0.0)
+    asyncio.run(die())
+    assert len(failed) == 1 and "died 5 times in a row" in failed[0]
 
 
 def test_what_was_finalised_is_the_first_of_the_files_of_a_flight(console: Console) -> None:

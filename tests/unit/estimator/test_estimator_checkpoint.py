@@ -20,7 +20,7 @@ from simulated_flight import (
 from terrafix.core.geodesy import rot_from_quat
 from terrafix.core.pose import log_so3
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.prior import CalibrationPrior, CheckpointWriter, EstimatorCheckpoint, NavPrior, load_checkpoint
+from terrafix.estimator.prior import CalibrationPrior, EstimatorCheckpoint, NavPrior, load_checkpoint
 from terrafix.messages import MeasurementVerdict, Odometry, Prediction, VehicleState, Verdict
 
 KILLED, BACK = 60, 66  # frames: three seconds
@@ -34,13 +34,9 @@ def flight() -> Flight:
 
 @pytest.fixture(scope="module")
 def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> EstimatorCheckpoint:
-    """Its last checkpoint, through the file."""
-    file = tmp_path_factory.mktemp("run") / "estimator.checkpoint"
-    assert load_checkpoint(file) is None
-    keeper = CheckpointWriter(file)
-    for message in [flight.fix(KILLED - 2), *EstimatorRun().fly(flight, 0, KILLED).published]:
-        keeper.on_message(message)
-    last = load_checkpoint(file)
+    folder = tmp_path_factory.mktemp("run")
+    assert load_checkpoint(folder / "estimator.checkpoint") is None
+    last = EstimatorRun().checkpoint(flight, KILLED, folder)
     assert last is not None and last.estimate.frame_id == KILLED - 1
     return last
 

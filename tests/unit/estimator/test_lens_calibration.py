@@ -1,16 +1,15 @@
 """Radial coefficient of the lens beyond its description: a state of the graph, estimated in flight without a map."""
 
 import gtsam
-import msgspec
 import numpy as np
 import pytest
 
-from simulated_flight import ORIGIN, EstimatorRun, Flight
+from simulated_flight import ORIGIN, EstimatorRun, Flight, with_distortion
 from terrafix.estimator.factors.plane_two_view import LensNoise, plane_two_view_factor
 from terrafix.estimator.models.lens_prior import RADIAL_K1_SIGMA
 from terrafix.estimator.models.plane_motion import Ground, MatchedRays
 from terrafix.estimator.state import CALIBRATION_SIZE, RADIAL_K1
-from terrafix.messages import MapMatch, Message, Odometry
+from terrafix.messages import MapMatch
 
 MAPPED = 30  # frames with map matches
 
@@ -72,20 +71,10 @@ def test_pairs_with_a_lens_in_their_noise_say_nothing_of_focal_length_and_radial
 @pytest.mark.parametrize("k1", [-0.01, 0.0])
 def test_the_radial_coefficient_is_estimated_in_flight_and_stays_zero_without_distortion(k1: float) -> None:
     flight, run = Flight(200, seed=2), EstimatorRun()
-
-    def with_distortion(message: Message) -> Message:
-        if not isinstance(message, Odometry) or not message.two_view:
-            return message
-        pairs = np.array(message.two_view)
-        pairs = np.hstack([distorted(pairs[:, :2], k1), distorted(pairs[:, 2:], k1)])
-        return msgspec.structs.replace(
-            message, two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in pairs]
-        )
-
     run.feed([ORIGIN])
     for i in range(flight.frames):
         messages = [m for m in flight.messages(i) if i < MAPPED or not isinstance(m, MapMatch)]
-        run.feed(map(with_distortion, messages))
+        run.feed(with_distortion(message, k1) for message in messages)
     assert run.node.estimator is not None
     graph = run.node.estimator.graph
     estimate = float(graph.state(graph.newest).calibration[RADIAL_K1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C
 
-from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight
+from simulated_flight import CAMERA, ORIGIN, EstimatorRun, Flight, with_distortion
 from terrafix.anchor.matching.orthorectify import rectify
 from terrafix.core.camera import CameraCalibration, distort_division, undistort_division
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
@@ -21,7 +21,6 @@ from terrafix.messages import (
     MapPose,
     Message,
     NavEstimate,
-    Odometry,
     Prediction,
     Verdict,
 )
@@ -121,23 +120,11 @@ def test_the_lens_uncertainty_of_map_poses_does_not_average_out() -> None:
 
 def test_an_undescribed_lens_is_estimated_within_a_few_frames() -> None:
     flight, run = Flight(24, seed=3), EstimatorRun()
-
-    def with_distortion(message: Message) -> Message:
-        if not isinstance(message, Odometry) or not message.two_view:
-            return message
-        pairs = np.array(message.two_view)
-        pairs = np.hstack(
-            [distort_division(pairs[:, :2], ACTION_CAMERA_K1), distort_division(pairs[:, 2:], ACTION_CAMERA_K1)]
-        )
-        return msgspec.structs.replace(
-            message, two_view=[(float(a), float(b), float(c), float(d)) for a, b, c, d in pairs]
-        )
-
     published: list[Message] = []
     published += run.node.on(msgspec.structs.replace(ORIGIN, camera=UNCALIBRATED))
     for i in range(flight.frames):
         for message in flight.messages(i):
-            published += run.node.on(with_distortion(message))
+            published += run.node.on(with_distortion(message, ACTION_CAMERA_K1))
     published_k1 = [m.radial_k1 for m in published if isinstance(m, Prediction)]
     assert published_k1[0] == 0.0
     assert published_k1[-1] == pytest.approx(ACTION_CAMERA_K1, abs=0.04)

@@ -1,28 +1,33 @@
 """Batch smoother after landing: accuracy, consistency, and rejection of outlier map matches."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import gtsam
 import msgspec
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import M
+from gtsam.symbol_shorthand import C, M
 
 from map_matches import with_search
 from recorded_flight import blind_between, errors, replayed_graph, shifted, unmatched
 from simulated_flight import ORIGIN, EstimatorRun, Flight, error_m
 from terrafix.core.geodesy import local_rotation_up
+from terrafix.core.map_error import shared_variance_m2
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.measurements.principal_point import PrincipalPointFilter
 from terrafix.estimator.models.lens_prior import principal_point_sigma
+from terrafix.estimator.models.plane_motion import MatchedRays
+from terrafix.estimator.state import NodeState
 from terrafix.messages import MapMatch, Message, SearchResult, Verdict
 from terrafix.smoother.gnc import solve
 from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
-from terrafix_tools.finalise.fix_consistency import lost_sigma
-from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer
-from terrafix_tools.finalise.submaps import _submap
+from terrafix_tools.finalise.fix_consistency import information_shares, lost_sigma
+from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer, RecordedNode
+from terrafix_tools.finalise.run import refined_track
+from terrafix_tools.finalise.submaps import _moved, _submap
 from terrafix_tools.score import nees_of
 
 FAR_M = (350.0, -200.0)
@@ -72,7 +77,11 @@ def test_an_unknown_principal_point_widens_the_solution_by_its_lever_and_a_map_i
     camera = msgspec.structs.replace(graph.origin.camera, focal_sigma=0.1)
     graph.principal_point = None
     known, graph.principal_point = smooth(graph), PrincipalPointFilter(camera)
+    graph.principal_point.offset[:] = 0.02, 0.01
     unknown = smooth(graph)
+    for pose, seen in zip(unknown.poses, unknown.camera, strict=True):
+        aside_m = pose.rotation().matrix()[:2, :2] @ (2.0, 1.0)  # of 100 m, from the camera that map matches see
+        assert (pose.translation() - seen.translation())[:2] == pytest.approx(aside_m, abs=0.2)
     variance_m2 = [
         np.array([tangent_to_world(c, p.rotation().matrix())[0, 0] for c, p in zip(one.covs, one.poses, strict=True)])
         for one in (known, unknown)
@@ -93,6 +102,18 @@ def test_only_a_map_match_that_nothing_contradicted_ends_the_doubt_of_the_nodes_
     inliers, begins = np.ones(2, bool), np.zeros(8, int)
     assert lost_sigma(flight, inliers, begins).tolist() == [0.0] * 3 + [800.0] * 5
     assert lost_sigma(flight, np.array([False, True]), begins).tolist() == [800.0] * 8
+
+
+def test_how_much_ground_two_map_matches_share_depends_on_the_height_above_it() -> None:
+    shares = []
+    for ground_m in (0.0, 500.0):
+        flight = FlightGraph(msgspec.structs.replace(ORIGIN, ground_amsl_m=ground_m))
+        for i in range(4):
+            pose = gtsam.Pose3(gtsam.Rot3(), np.array([40.0 * i, 0.0, ground_m + 100.0]))
+            flight.recorder.nodes.append(RecordedNode(float(i), NodeState(pose, np.zeros(6), np.zeros(8)), []))
+            flight.fixes.append(Fix(i, pose, np.eye(6), 1.0, False, np.zeros((6, 2)), 0.0, True, None))
+        shares.append(information_shares(flight))
+    assert shares[0] == shares[1] and shares[0][0] == 1.0 > shares[0][1]
 
 
 def test_map_matches_over_the_same_ground_count_with_their_share(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,6 +155,33 @@ def test_an_error_of_the_height_is_the_scale_of_a_segment_and_not_of_its_steps()
     ground, step_m = node.motion.rays.ground, node.motion.r.T @ node.motion.p_m
     left = node.motion.cov - _submap([first, node], 0, 0.1).step_cov[1]
     assert np.trace(left) == pytest.approx(step_m @ step_m * (ground.height_sigma_m / ground.height_m) ** 2)
+
+
+def test_a_segment_that_is_moved_turns_its_velocity_and_not_what_is_in_the_axes_of_the_camera() -> None:
+    state = NodeState(gtsam.Pose3(), np.zeros(6), np.array([10.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.1, 0.2]))
+    moved = _moved(state, gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2.0), np.ones(3)))
+    assert moved.motion == pytest.approx([0.0, 10.0, 1.0, 2.0, 0.0, 0.0, 0.1, 0.2])
+
+
+def test_positions_that_the_estimator_refines_have_the_error_of_the_map_on_earth() -> None:
+    graph, turned = replayed_graph(Flight(3, seed=4)), gtsam.Rot3.Rz(0.5).matrix()
+    past = SimpleNamespace(r_w_c=turned, p_m=np.zeros(3), cov=np.diag([4.0, 4.0, 9.0, 0.01, 0.01, 0.01]))
+    estimator: Any = SimpleNamespace(map_sigma_m=5.0, refine=lambda: {0: past, 99: past})
+    ((frame_id, placed),) = refined_track(graph, estimator).items()
+    variances = np.diag(tangent_to_world(placed.cov, turned))
+    assert frame_id == 0 and variances[:3] == pytest.approx([4.0 + shared_variance_m2(5.0)] * 2 + [9.0])
+
+
+def test_the_height_over_sloping_ground_follows_its_keyframe(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, seen = replayed_graph(Flight(6, seed=4, fix_every=3)), list[MatchedRays]()
+    smoothing = batch_smoother._Smoothing(graph, lambda *_: None)
+    i, node = next((i, n) for i, n in enumerate(graph.recorder.nodes) if n.motion is not None and n.motion.rays)
+    assert node.motion is not None and node.motion.rays is not None
+    ground = replace(node.motion.rays.ground, slope_e=0.5, slope_n=-0.2)
+    then_m = smoothing._values.atPose3(C(node.parent)).translation() - (10.0, 5.0, 3.0)
+    monkeypatch.setattr(batch_smoother, "plane_two_view_factor", lambda *given: seen.append(given[5]))
+    smoothing._plane_factor(node.parent, i, replace(node.motion, rays=replace(node.motion.rays, ground=ground)), then_m)
+    assert seen[0].ground.height_m == pytest.approx(ground.height_m + 3.0 - (0.5 * 10.0 - 0.2 * 5.0))
 
 
 def test_a_blackout_is_interpolated_from_both_sides() -> None:

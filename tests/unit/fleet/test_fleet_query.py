@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 from fleet_records import LAKE_M, LAKE_RADIUS_M, write_records
 from terrafix.core.errors import OutputError, SourceError, UsageError
-from terrafix_tools.cli import app
+from terrafix_tools.cli import app, main
 from terrafix_tools.fleet.build import build
 from terrafix_tools.fleet.page import months, write_page
 from terrafix_tools.fleet.places import METRES_PER_DEG, grids, picture, worst
@@ -122,10 +122,14 @@ def test_what_is_wrong_in_a_statement_is_said_in_one_line(fleet: Path, sql: str)
     assert "\n" not in str(caught.value) and "LINE 1" not in str(caught.value)
 
 
-def test_without_duckdb_one_line_states_what_to_install(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_duckdb_one_line_states_what_to_install(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setitem(sys.modules, "duckdb", None)
-    with pytest.raises(UsageError, match=r"need duckdb; install it: .*\[fleet\]'"):
-        query(fleet, "SELECT 1")
+    monkeypatch.setattr(sys, "argv", ["terrafix", "fleet", "query", str(fleet), "SELECT 1"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "this command needs duckdb; install it: " in capsys.readouterr().err
 
 
 def test_a_folder_without_a_fleet_is_one_line(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_without_nvpmodel_there_is_no_power_mode(tmp_path: Path) -> None:
     assert read_power_mode(tmp_path / "status", tmp_path / "modes") is None
 
 
-def test_health_states_power_and_clock_limit_of_the_reading(tmp_path: Path) -> None:
+def test_health_and_the_line_of_a_thermal_band_have_power_and_clock_of_the_reading(tmp_path: Path) -> None:
     orin(tmp_path)
     config = Config(health=HealthSection(sysfs_root=str(tmp_path)))
     edge = make_edge(NodeContext(config=config, frames=MemoryFrameStore(1), map_path=None, out_dir=tmp_path))
@@ -118,20 +118,8 @@ def test_health_states_power_and_clock_limit_of_the_reading(tmp_path: Path) -> N
     assert (len(reading.clocks), len(reading.rails), len(reading.fans)) == (3, 3, 1)
     (health,) = HealthNode(config.health).on(reading)
     assert isinstance(health, Health)
-    assert (health.power_w, health.clock_limit, health.clock_mhz) == (
-        pytest.approx(7.56),
-        pytest.approx(612 / 918),
-        612.0,
-    )
-
-
-def test_the_line_of_a_thermal_band_has_power_and_clock(tmp_path: Path) -> None:
-    orin(tmp_path)
-    config = Config(health=HealthSection(sysfs_root=str(tmp_path)))
-    edge = make_edge(NodeContext(config=config, frames=MemoryFrameStore(1), map_path=None, out_dir=tmp_path))
-    (reading,) = edge.poll(0)
-    assert isinstance(reading, ThermalReading)
-    (health,) = HealthNode(config.health).on(reading)
+    found = health.power_w, health.clock_limit, health.clock_mhz
+    assert found == (pytest.approx(7.56), pytest.approx(612 / 918), 612.0)
     writer = logs.configure("INFO", "health", stream := io.StringIO())
     edge.on_message(health)
     edge.on_message(health)  # the same band

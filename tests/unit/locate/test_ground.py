@@ -163,11 +163,12 @@ def test_cloud_of_a_flight_has_ground_and_house(tmp_path: Path) -> None:
     assert len(build_cloud(flight, 1, None).points_m) == 0, "of another fragment"
 
 
-def test_cloud_has_the_level_of_the_elevation(tmp_path: Path) -> None:
+def test_cloud_has_the_level_and_the_size_of_the_elevation(tmp_path: Path) -> None:
     flight = read_views(rig.write_flight(tmp_path / "flight.mcap"))
-    cloud = build_cloud(flight, 0, lambda e_m, _n_m: np.full(e_m.shape, 503.0))
+    cloud = build_cloud(flight, 0, lambda e_m, _n_m: np.full(e_m.shape, 520.0))
     away = np.abs(cloud.points_m[:, 0] - rig.HOUSE_E_M) > 25.0
-    assert np.median(cloud.points_m[away, 2]) == pytest.approx(503.0, abs=0.05)
+    assert np.median(cloud.points_m[away, 2]) == pytest.approx(520.0, abs=0.05)
+    assert np.median(cloud.sigma_m / build_cloud(flight, 0, None).sigma_m) == pytest.approx(0.8, abs=0.01)
 
 
 def test_the_points_of_a_finalised_flight_are_used_whatever_their_fragment(tmp_path: Path) -> None:

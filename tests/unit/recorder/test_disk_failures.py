@@ -31,7 +31,6 @@ from terrafix.recorder.segments import FSYNC_S, MEGABYTE, PROTECTED, RETRY_S, SE
 from terrafix.recorder.writer import FlightWriter
 from terrafix.runtime.supervisor import _writable
 
-SEGMENT = 8 * MEGABYTE  # of a budget of 64 MB
 BOOTS = ["a" * 32, "b" * 32, "c" * 32]
 
 

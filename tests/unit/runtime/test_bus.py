@@ -17,7 +17,7 @@ from gps_messages import GPS
 from runtime_nodes import ORIGIN, frame, prediction
 from terrafix import messages as m
 from terrafix.core import logs
-from terrafix.core.node import Edge, Node
+from terrafix.core.node import Edge, Node, NodeBase
 from terrafix.processes import ALL_MESSAGES, Process
 from terrafix.runtime.bus import BUS_QUEUE_LENGTH, Publisher, Subscriber
 from terrafix.runtime.executor import LiveShell
@@ -158,7 +158,7 @@ def test_messages_lost_by_a_slow_subscriber_are_counted_and_publishing_does_not_
     assert got + slow.lost["Frame"] == total
 
 
-class SlowNode:
+class SlowNode(NodeBase):
     """Takes 0.1 s for a Prediction and publishes a MapMatch for it."""
 
     def on(self, message: m.Message) -> Iterable[m.Message]:
@@ -171,9 +171,6 @@ class SlowNode:
                 matcher="test",
                 place=m.MatchPlace(e_m=message.step_m[0], n_m=0.0, mass=1.0),
             )
-
-    def tick(self, now_ns: int) -> Iterable[m.Message]:
-        return ()
 
 
 SLOW = Process("slow", "", (m.Prediction,), (m.MapMatch,), 0.0, 1.0, (m.Prediction,))
@@ -222,12 +219,9 @@ def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_on
     progress.close()
 
 
-class TickingNode:
+class TickingNode(NodeBase):
     def __init__(self) -> None:
         self.ticks_ns: list[int] = []
-
-    def on(self, message: m.Message) -> Iterable[m.Message]:
-        return ()
 
     def tick(self, now_ns: int) -> Iterable[m.Message]:
         self.ticks_ns.append(now_ns)

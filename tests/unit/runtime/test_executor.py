@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from runtime_nodes import ORIGIN, frame, prediction
+from runtime_nodes import ORIGIN, frame, prediction, status
 from terrafix import messages as m
 from terrafix.core import codec
 from terrafix.core.clock import Ticker
@@ -17,12 +17,6 @@ from terrafix_tools.in_process import InProcessShell
 
 def verdict(frame_id: int, measurement: str) -> m.MeasurementVerdict:
     return m.MeasurementVerdict(t_ns=0, frame_id=frame_id, measurement=measurement, verdict=m.Verdict.ACCEPTED)
-
-
-def status(now_ns: int) -> m.LinkStatus:
-    return m.LinkStatus(
-        t_ns=now_ns, connected=False, autopilot="none", sysid=1, sent=0, received=0, bad=0, time_offset_ms=None
-    )
 
 
 class ReplyingNode:

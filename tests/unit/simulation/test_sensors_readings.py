@@ -13,7 +13,7 @@ from terrafix_lab.sim.sensors.suite import VehicleSensors
 from vehicle_missions import PLACE
 from vehicle_state import STEP_S, changes, state
 
-KEPT = {"yaw_constant_rad", "yaw_slow_s", "attitude_slow_s", "range_limits_m"}
+KEPT = {"yaw_constant_rad", "yaw_slow_s", "attitude_slow_s"}
 PERFECT = replace(TYPICAL, **{f.name: 0.0 for f in fields(SensorErrors) if f.name not in KEPT})
 
 
@@ -22,14 +22,13 @@ def read(sensors: VehicleSensors, seconds: float, **changes: object) -> list[Rea
 
 
 def test_without_errors_the_readings_are_the_truth() -> None:
-    sensors = VehicleSensors(PLACE, errors=PERFECT, rangefinder=True)
+    sensors = VehicleSensors(PLACE, errors=PERFECT)
     turned = state(0.0, roll_rad=0.3, pitch_rad=-0.1, rates_b_radps=np.array([0.1, -0.2, 0.3]), agl_m=40.0)
     reading = sensors.read(turned)
     assert reading.gyro_b_radps == pytest.approx([0.1, -0.2, 0.3])
     assert reading.accel_b_mps2 == pytest.approx([0.0, 0.0, -9.80665])
     assert (reading.yaw_rad, reading.pitch_rad, reading.roll_rad) == pytest.approx((math.pi / 2, -0.1, 0.3))
     assert (reading.baro_amsl_m, reading.airspeed_mps) == pytest.approx((500.0, 20.0))
-    assert reading.range_m == pytest.approx(40.0 / (math.cos(0.3) * math.cos(0.1)))
 
 
 def test_inertial_noise_is_that_of_the_data_sheet_on_the_ground_and_vibration_in_flight() -> None:
@@ -102,18 +101,6 @@ def test_the_scale_error_of_the_barometer_refers_to_the_start() -> None:
     high = sensors.read(state(0.04, p_b_in_w_m=np.array([0.0, 0.0, 700.0]))).baro_amsl_m
     assert low == pytest.approx(500.0)
     assert abs(high - 700.0) > 1.0
-
-
-def test_the_rangefinder_has_limits_and_drops_out() -> None:
-    def share(agl_m: float, **changes: object) -> float:
-        found = read(VehicleSensors(PLACE, seed=1, rangefinder=True), 40.0, agl_m=agl_m, **changes)
-        return sum(r.range_m is not None for r in found) / len(found)
-
-    assert 0.96 < share(30.0) < 0.995
-    assert share(70.0) == 0.0
-    assert share(30.0, roll_rad=1.2) == 0.0
-    assert share(0.05) < 0.1
-    assert all(r.range_m is None for r in read(VehicleSensors(PLACE, seed=1), 1.0))
 
 
 def test_the_same_seed_gives_the_same_readings() -> None:

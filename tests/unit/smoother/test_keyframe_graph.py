@@ -19,7 +19,9 @@ STEP = gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.array([5.0, 1.0, 0.0]))
 
 def node(i: int, parent: int | None = None, between: gtsam.Pose3 = STEP) -> FrameNode:
     cov = COV if parent is not None else 100.0 * np.eye(6)
-    return FrameNode(i, i * 10**9, 0, 100.0, gtsam.Pose3() if parent is None else between, cov, parent, 0.01, 1e-6)
+    return FrameNode(
+        i, i * 10**9, 0, 100.0, gtsam.Pose3() if parent is None else between, cov, parent, 0.02 - i % 2 / 100, 1e-6
+    )
 
 
 def chain(frames: int, max_keyframes: int = 256) -> KeyframeGraph:
@@ -39,7 +41,7 @@ def world(i: int) -> gtsam.Pose3:
 
 
 def test_keyframes_are_bounded_and_what_hung_on_one_that_goes_keeps_its_pose_and_gains_its_covariance() -> None:
-    graph = chain(40, max_keyframes=10)
+    graph = chain(40, max_keyframes=10)  # every second frame has a length that is known half as well
     assert len(graph.keyframes) == 10 and graph.keyframes[0] == 0 and graph.keyframes[-1] == 38
     for i, frame in graph.frames.items():
         if frame.parent is not None:
@@ -48,6 +50,14 @@ def test_keyframes_are_bounded_and_what_hung_on_one_that_goes_keeps_its_pose_and
             assert frame.walk2 == pytest.approx(1e-6 * (i - frame.parent))
             assert _submap(graph, [frame.parent, i]).scale_walk[1] ** 2 == pytest.approx(frame.walk2)
             assert frame.cov[5, 5] == pytest.approx(COV[5, 5] * (i - frame.parent), rel=0.1)
+            assert frame.scale_sigma == (0.01 if i - frame.parent == 1 and i % 2 else 0.02)
+
+
+def test_the_error_of_a_length_is_along_the_way_in_the_axes_of_the_frame() -> None:
+    turned = gtsam.Pose3(gtsam.Rot3.Rz(0.5), np.array([10.0, 2.0, 0.0]))
+    way_m = turned.rotation().matrix().T @ turned.translation()
+    along_m2 = (with_scale(replace(node(1, 0, turned), scale_sigma=0.1)) - COV)[3:, 3:]
+    assert np.allclose(along_m2, 0.1**2 * np.outer(way_m, way_m))
 
 
 def test_the_keyframes_that_go_are_spread_over_the_flight() -> None:

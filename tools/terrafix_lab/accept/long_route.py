@@ -1,28 +1,24 @@
 """A long route from a short flight."""
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 import msgspec
 
-from terrafix.messages import Origin, VehicleState
+from terrafix.messages import VehicleState
 from terrafix.vision.sources import Shot, Source
+from terrafix.vision.sources.contract import WrappedSource
 from terrafix_lab.accept.flight import FrameRef
 
 LAP_MARK = "@"  # "0001.jpg@2": the same picture flown over again
 
 
-class ThereAndBack:
+class ThereAndBack(WrappedSource):
     """The flight forwards and backwards in turn: a long route from a short one. Implements Source."""
-
-    live = False
 
     def __init__(self, source: Source, frame_refs: list[FrameRef], frames: int) -> None:
         """``stops``: every frame of ``source``. ``frames``: of the long flight."""
-        self._source, self._frame_refs, self._frames = source, frame_refs, frames
-
-    def origin(self) -> Origin:
-        return self._source.origin()
+        super().__init__(source)
+        self._frame_refs, self._frames = frame_refs, frames
 
     def length(self) -> int | None:
         return self._frames
@@ -40,15 +36,6 @@ class ThereAndBack:
             frame = msgspec.structs.replace(shot.frame, frame_id=number, file=file, t_ns=round(t_s * 1e9))
             states = () if ref.state is None else (_moved(ref.state, frame.t_ns, bool(lap % 2)),)
             yield Shot(frame, states, shot.image)
-
-    def map_hint(self) -> Path | None:
-        return self._source.map_hint()
-
-    def name(self) -> str:
-        return self._source.name()
-
-    def close(self) -> None:
-        self._source.close()
 
 
 def _moved(state: VehicleState, t_ns: int, backwards: bool) -> VehicleState:

@@ -5,8 +5,8 @@ and the map around the predicted position; points of both are matched, and a hom
 position is the nadir point, transformed by the homography. The prediction is the estimator's, which has used all
 earlier frames: a system of this method alone would have a worse one.
 
-SIFT and AKAZE with ratio test (Lowe 2004), XFeat (CVPR 2024) with mutual nearest neighbours and with LighterGlue.
-AKAZE is in OpenCV 4 only; the models are those of the folder MODELS."""
+SIFT with ratio test (Lowe 2004), XFeat (CVPR 2024) with mutual nearest neighbours and with LighterGlue; the models are
+those of the folder MODELS."""
 
 import time
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ RANSAC_PX = 5.0  # wide, for relief and the perspective of buildings
 MIN_INLIERS = 8  # wrong homographies have 4 to 7
 MAX_POINTS = 4096  # of XFeat in each image: the default of its authors (accelerated_features, top_k)
 MAX_JOINED_POINTS = 1024  # of LighterGlue, whose cost is quadratic
-SIFT, AKAZE, XFEAT, LIGHTERGLUE = "SIFT, ratio test", "AKAZE, ratio test", "XFeat, mutual nearest", "XFeat, LighterGlue"
+SIFT, XFEAT, LIGHTERGLUE = "SIFT, ratio test", "XFeat, mutual nearest", "XFeat, LighterGlue"
 MODELS = {XFEAT: ("xfeat", MAX_POINTS), LIGHTERGLUE: ("lighterglue-l3", MAX_JOINED_POINTS)}
 RESULT = "peers.json"
 
@@ -56,11 +56,11 @@ class PointMethod(Protocol):
         ...
 
 
-class OpenCVPoints:
-    """A detector of OpenCV with the ratio test. ``norm``: of its descriptors."""
+class SiftPoints:
+    """With the ratio test."""
 
-    def __init__(self, detector: Any, norm: int) -> None:
-        self._detector, self._matcher = detector, cv2.BFMatcher(norm)
+    def __init__(self) -> None:
+        self._detector, self._matcher = cv2.SIFT.create(), cv2.BFMatcher(cv2.NORM_L2)
 
     def points(self, image: Image, mask: np.ndarray) -> Keypoints:
         gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -167,12 +167,8 @@ class Peer:
 
 def methods(models: Path | None) -> tuple[dict[str, PointMethod], list[str]]:
     """-> methods that can run here, and why others cannot. ``models``: folder of the models; None: without them."""
-    found: dict[str, PointMethod] = {SIFT: OpenCVPoints(cv2.SIFT.create(), cv2.NORM_L2)}
+    found: dict[str, PointMethod] = {SIFT: SiftPoints()}
     missing = []
-    if hasattr(cv2, "AKAZE_create"):
-        found[AKAZE] = OpenCVPoints(cv2.AKAZE_create(), cv2.NORM_HAMMING)
-    else:
-        missing.append(f"{AKAZE}: OpenCV {cv2.__version__} does not have it")
     for title, (name, most) in MODELS.items():
         if models is None:
             missing.append(f"{title}: no weights")

@@ -1,5 +1,5 @@
 """`terrafix bench`: time, memory and accuracy of whole replays, compared with peers on the same frames: SIFT + RANSAC,
-which is the baseline of all ratios, AKAZE, XFeat and LighterGlue.
+which is the baseline of all ratios, XFeat and LighterGlue.
 
 Every measurement runs in its own process, one after the other. Milliseconds depend on the machine and its load; the
 ratio to the baseline, measured minutes apart on the same machine, depends on them less, and the ratio of processor

@@ -4,22 +4,20 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 
 import msgspec
 
 from terrafix.messages import Frame, GimbalAttitude, Origin, VehicleState
 from terrafix.vision.sources import Shot, Source
+from terrafix.vision.sources.contract import WrappedSource
 from terrafix_lab.faults.edits import Edit, OriginEdit, unchanged, unchanged_origin
 from terrafix_lab.sim.interfaces import Readings, Sensors, State
 
 ANGLES = ("yaw_rad", "pitch_rad", "roll_rad")
 
 
-class AlteredSource:
+class AlteredSource(WrappedSource):
     """A Source that wraps and edits another one, and renumbers its frames."""
-
-    live = False
 
     def __init__(
         self,
@@ -30,7 +28,8 @@ class AlteredSource:
         origin: OriginEdit = unchanged_origin,
     ) -> None:
         """``frames``: limit of the frames of ``source``. ``origin``: edits start and camera."""
-        self._source, self._edit, self._frames, self._origin = source, edit, frames, origin
+        super().__init__(source)
+        self._edit, self._frames, self._origin = edit, frames, origin
 
     def origin(self) -> Origin:
         return self._origin(self._source.origin())
@@ -44,15 +43,6 @@ class AlteredSource:
         for number, shot in enumerate(self._edit(islice(self._source.shots(), self._frames))):
             if shot.frame.t_ns >= round(from_s * 1e9):
                 yield replace(shot, frame=msgspec.structs.replace(shot.frame, frame_id=number))
-
-    def map_hint(self) -> Path | None:
-        return self._source.map_hint()
-
-    def name(self) -> str:
-        return self._source.name()
-
-    def close(self) -> None:
-        self._source.close()
 
 
 class Stepwise:

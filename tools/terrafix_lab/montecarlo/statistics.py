@@ -94,20 +94,6 @@ class FlightResult:
         return cls(record, np.hypot(*error[:, :2].T), nees[0], nees[1], nees[2], (white[0], white[1], white[2]))
 
     @property
-    def false_fixes(self) -> int:
-        return int(self.track.is_false().sum())
-
-    @property
-    def notice_s(self) -> float | None:
-        """From the start of the first false input to the last false fix after it; None: there is none of either."""
-        return self.track.notice_s()
-
-    @property
-    def late_false_fixes(self) -> int:
-        """False fixes but those at the beginning of the first false input, while nothing can show it yet."""
-        return int(self.track.is_late().sum())
-
-    @property
     def track(self) -> Track:
         sigma_m = np.sqrt(np.linalg.eigvalsh(self.record.cov[:, :2, :2])[:, 1])
         return Track(self.record.t_s, self.distance_m, self.nees, sigma_m, self.record.lie)
@@ -148,6 +134,8 @@ def parts(flights: list[FlightResult]) -> dict[str, float]:
 
 def summary(flights: list[FlightResult]) -> dict[str, Any]:
     """Row of the table: over all frames of some flights."""
+    tracks = [f.track for f in flights]
+    false = [track.is_false().sum() for track in tracks]
     nees = np.concatenate([f.nees for f in flights])
     refined = np.concatenate([f.refined_nees() for f in flights])
     smoothed = np.concatenate([f.smoothed_nees() for f in flights])
@@ -173,11 +161,11 @@ def summary(flights: list[FlightResult]) -> dict[str, Any]:
         "max_m": float(distance.max()),
         "refined_median_m": float(np.median(refined_m)) if len(refined_m) else None,
         "smoothed_median_m": float(np.median(smoothed_m)) if len(smoothed_m) else None,
-        "false_fixes": sum(f.false_fixes for f in flights),
-        "late_false_fixes": sum(f.late_false_fixes for f in flights),
-        "criteria": measured([f.track for f in flights]),
-        "notice_s": max((f.notice_s for f in flights if f.notice_s is not None), default=None),
-        "flights_with_false_fixes": sum(f.false_fixes > 0 for f in flights),
+        "false_fixes": int(sum(false)),
+        "late_false_fixes": int(sum(track.is_late().sum() for track in tracks)),
+        "criteria": measured(tracks),
+        "notice_s": max((s for track in tracks if (s := track.notice_s()) is not None), default=None),
+        "flights_with_false_fixes": int(sum(count > 0 for count in false)),
         "coverage": coverage(nees),
         "coverage_refined": coverage(refined),
         "coverage_smoothed": coverage(smoothed),

@@ -5,10 +5,8 @@ from typing import Annotated
 
 import typer
 
-from terrafix.core.errors import UsageError
 from terrafix_lab.sim.autopilot.parameters import Gps, Kind
 from terrafix_lab.sim.world.map_content import MapContent
-from terrafix_tools.installation import install_command
 
 # Options of both `make` and `fly`.
 Seed = Annotated[int, typer.Option(help="Seed of the generated place, the course and all errors.")]
@@ -56,13 +54,8 @@ def ardupilot(
     ] = False,
 ) -> None:
     """Fly a mission with ArduPilot SITL on Terrafix' GPS_INPUT, in real time."""
-    try:
-        from terrafix_lab.sim.sitl.fly import Disturbance
-        from terrafix_lab.sim.sitl.fly import fly as fly_firmware
-    except ModuleNotFoundError as error:
-        if error.name != "mavsdk":
-            raise
-        raise UsageError(f"this command needs mavsdk; install it: {install_command('sim')}") from None
+    from terrafix_lab.sim.sitl.fly import Disturbance
+    from terrafix_lab.sim.sitl.fly import fly as fly_firmware
 
     code = fly_firmware(
         out,

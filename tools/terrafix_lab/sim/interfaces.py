@@ -81,7 +81,6 @@ class Readings:
     roll_rad: float
     baro_amsl_m: float
     airspeed_mps: float | None
-    range_m: float | None
     gnss: GnssFix | None
     gimbal: Quat | None = None  # attitude that a gimbal reports, of its axes into north, east, down
 
@@ -101,18 +100,3 @@ class Sensors(Protocol):
     """Errors are functions of seed and time: the same flight gives the same readings."""
 
     def read(self, state: State) -> Readings: ...
-
-
-class Autopilot(Protocol):
-    """Lock-step autopilot: no thread, socket or clock other than ``now_s``."""
-
-    def step(self, now_s: float, readings: Readings) -> None: ...
-
-    def receive(self, packets: bytes, now_s: float) -> None:
-        """Processes MAVLink bytes from the companion."""
-
-    def transmit(self) -> bytes:
-        """Returns the MAVLink bytes for the companion since the last call."""
-
-    def navigation(self) -> Navigation | None:
-        """Returns the navigation solution; None before there is a position."""

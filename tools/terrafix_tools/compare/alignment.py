@@ -16,6 +16,7 @@ from terrafix.core.errors import SourceError
 from terrafix.messages import Imu, InputOrder, MeasurementVerdict, Message, NavEstimate, Origin
 from terrafix.processes import PROCESSES
 from terrafix.recorder.reader import ReadResult, check_format, read_received
+from terrafix_tools.log.edit import origin_of
 
 NS = 1_000_000_000
 DIGEST_BYTES = 8  # of each message; two different ones are taken for equal once in 1e19 pairs
@@ -72,7 +73,7 @@ def read_record(path: Path) -> ComparedRecord:
     record: ComparedRecord | None = None
     for key, message in keyed(path, result):
         if record is None:
-            origin = _origin_of(path)
+            origin = origin_of(path)
             record = ComparedRecord(path, result, origin)
         record.digests[key] = digest(message, record.origin.t_ns)
         if key.frame_id >= 0:
@@ -90,7 +91,7 @@ def read_record(path: Path) -> ComparedRecord:
 
 def keyed(path: Path, result: ReadResult) -> Iterator[tuple[Key, Message]]:
     """Yields each message of the record with its key, in the order of the record."""
-    zero_ns = _origin_of(path).t_ns
+    zero_ns = origin_of(path).t_ns
     seen: Counter[tuple[str, int, int, str]] = Counter()
     for _, _, _, message in read_received(path, result):
         if isinstance(message, Origin) and seen[("Origin", -1, 0, "")]:
@@ -119,16 +120,6 @@ def contents(message: Message, zero_ns: int) -> dict[str, Any]:
 
 def digest(message: Message, zero_ns: int) -> bytes:
     return hashlib.blake2b(msgspec.msgpack.encode(contents(message, zero_ns)), digest_size=DIGEST_BYTES).digest()
-
-
-def _origin_of(path: Path) -> Origin:
-    """The first Origin of a record. Raises SourceError."""
-    result = ReadResult()
-    for _, _, _, message in read_received(path, result):
-        if isinstance(message, Origin):
-            return message
-    check_format(path, result)
-    raise SourceError(f"{path}: the record has no origin of a flight; was the source of the flight opened?")
 
 
 def _estimate(message: NavEstimate, zero_ns: int) -> ComparedEstimate:

@@ -15,7 +15,6 @@ from pyarrow import dataset
 from terrafix.core.errors import SourceError, UsageError
 from terrafix_tools.fleet.store import check_fleet, read_list
 from terrafix_tools.fleet.tables import PART, PARTITIONS, RECORDS, TABLES
-from terrafix_tools.installation import install_command
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -52,12 +51,10 @@ class FleetTables:
 
     def __init__(self, folder: Path, *, keep: bool = False) -> None:
         """``keep``: reads the files once, for many queries. Raises SourceError: there is no fleet, or a file of it
-        cannot be read; UsageError: DuckDB is not installed."""
+        cannot be read."""
         check_fleet(folder)
-        try:
-            import duckdb
-        except ModuleNotFoundError:
-            raise UsageError(f"queries of a fleet need duckdb; install it: {install_command('fleet')}") from None
+        import duckdb
+
         self._folder = folder
         self._duckdb_error = duckdb.Error
         self._select = duckdb.StatementType.SELECT

@@ -29,9 +29,11 @@ from terrafix.map.format import (
 )
 from terrafix.map.package import MapPackage
 from terrafix_engines.retrieval.pooled import PooledGradientDescriber
+from terrafix_engines.store import sha256_of
 from terrafix_tools.mapping.build_checks import check_date, check_out, check_reach
 from terrafix_tools.mapping.choices import Descriptors
-from terrafix_tools.mapping.layers import ElevationInput, Imagery, LayerInput, VectorInput
+from terrafix_tools.mapping.imagery import Imagery
+from terrafix_tools.mapping.layers import ElevationInput, LayerInput, VectorInput
 from terrafix_tools.mapping.mosaic.accuracy import add_accuracy_estimates
 from terrafix_tools.mapping.mosaic.collar import find_collar
 from terrafix_tools.mapping.package.dem import TILES_PER_WORKER, DemSource, height_places, open_heights, write_elevation
@@ -53,8 +55,6 @@ from terrafix_tools.parallel.pool import (
     render_pieces,
 )
 from terrafix_tools.progress import Bar, progress_bar
-
-HASH_CHUNK = 1 << 20
 
 
 def build(
@@ -84,7 +84,7 @@ def layer_of(imagery: Path, *, date: str = "", licence: str = "", ce90_m: float 
     return LayerInput(
         open=partial(ImagerySource, imagery.absolute()),  # a worker may have another working directory
         source=imagery.name,
-        source_sha256=_sha256(imagery),
+        source_sha256=sha256_of(imagery),
         where=str(imagery),
         date=date,
         licence=licence,
@@ -314,11 +314,3 @@ def _count_steps(pieces: Generator[Piece, None, None], step: Callable[[], None])
         for piece in pieces:
             step()
             yield piece
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(HASH_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()

@@ -7,7 +7,7 @@ from pyproj import Transformer
 
 from terrafix.core.errors import MapError, OutputError, UsageError
 from terrafix_tools.mapping.area.checks import POLAR_DEG
-from terrafix_tools.mapping.layers import Imagery
+from terrafix_tools.mapping.imagery import Imagery
 
 
 def check_reach(imagery: Path, source: Imagery) -> None:

@@ -10,57 +10,11 @@ from pyproj import CRS
 
 from terrafix.map.format import DemGrid, InputStatement
 from terrafix_tools.mapping.area.polygons import Area
+from terrafix_tools.mapping.imagery import Bounds, Imagery
 
-Bounds = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max in the CRS
 Feature = tuple[
     str, bytes, Mapping[str, str]
 ]  # table (roads, water, buildings), 2D WKB in WGS84 (lon, lat), attributes
-
-
-class Imagery(Protocol):
-    """North-up pixels in one projected CRS: pixel (r, c) covers [x_min + c pixel_x, y_max - r pixel_y).
-
-    A context manager. Implemented by ``ImagerySource`` and by ``Mosaic``."""
-
-    @property
-    def crs(self) -> CRS: ...
-    @property
-    def width_px(self) -> int: ...
-    @property
-    def height_px(self) -> int: ...
-    @property
-    def pixel_x(self) -> float: ...
-    @property
-    def pixel_y(self) -> float: ...
-    @property
-    def x_min(self) -> float: ...
-    @property
-    def y_max(self) -> float: ...
-    @property
-    def bounds(self) -> Bounds: ...
-    @property
-    def gsd_m(self) -> float:
-        """Ground metres per pixel at the centre."""
-        ...
-
-    @property
-    def has_mask(self) -> bool:
-        """False: the source has no validity mask; it is searched for a black or white collar."""
-        ...
-
-    @property
-    def statements(self) -> tuple[InputStatement, ...]:
-        """What the files of the source were taken for."""
-        ...
-
-    def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-        """A window inside the image: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255."""
-        ...
-
-    def __enter__(self) -> Self: ...
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
 
 
 class Elevation(Protocol):

@@ -5,14 +5,13 @@ import re
 import uuid
 import warnings
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
 import numpy as np
 import rasterio
 import rasterio.shutil
-from pyproj import CRS, Geod, Transformer
+from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
@@ -23,6 +22,7 @@ from rasterio.windows import Window
 from terrafix.core.errors import MapError
 from terrafix.map.format import InputStatement
 from terrafix_tools.mapping.datum import check_datum, crs_of
+from terrafix_tools.mapping.imagery import Imagery, ground_distance_m, ground_pixel_m
 from terrafix_tools.mapping.sources.utm import utm_epsg
 from terrafix_tools.mapping.ways import accuracy_to_wgs84
 
@@ -31,7 +31,7 @@ SAMPLE_PX = 1024  # side of the downsampled image that determines the value rang
 STRETCH_PERCENT = (0.5, 99.5)  # percentiles of the sample; 16-bit and float pixels outside saturate
 
 
-class ImagerySource:
+class ImagerySource(Imagery):
     """North-up view of an image: pixel (r, c) covers [x_min + c px, y_max - r py) in `crs`. A context manager.
 
     ``hidden``: a raster on the image's own pixels, not zero where they are a collar. ``raw``: the image's own pixels,
@@ -70,12 +70,7 @@ class ImagerySource:
         self.has_mask = self.warped or self.file_has_mask
         self._stretch = self._find_stretch()
 
-    def __enter__(self) -> "ImagerySource":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         if self._hidden is not None:
             self._hidden.close()
         if self._data is not self._file:
@@ -85,23 +80,6 @@ class ImagerySource:
     @property
     def transform(self) -> Affine:
         return Affine(self.pixel_x, 0, self.x_min, 0, -self.pixel_y, self.y_max)
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, y_min, x_max, y_max in the CRS."""
-        return (
-            self.x_min,
-            self.y_max - self.height_px * self.pixel_y,
-            self.x_min + self.width_px * self.pixel_x,
-            self.y_max,
-        )
-
-    @property
-    def gsd_m(self) -> float:
-        """Ground metres per pixel at the centre, on the ellipsoid; EPSG:3857 pixels are smaller than nominal."""
-        x = self.x_min + 0.5 * self.width_px * self.pixel_x
-        y = self.y_max - 0.5 * self.height_px * self.pixel_y
-        return ground_pixel_m(self.crs, x, y, self.pixel_x, self.pixel_y)
 
     @property
     def statements(self) -> tuple[InputStatement, ...]:
@@ -292,18 +270,6 @@ def open_raster(path: Path) -> Any:
             return rasterio.open(path)
     except (RasterioError, UnicodeDecodeError):  # GDAL's message may quote the bytes of a damaged file
         raise MapError(f"{path}: not an image that GDAL can read; give a GeoTIFF") from None
-
-
-def ground_pixel_m(crs: CRS, x: float, y: float, pixel_x: float, pixel_y: float) -> float:
-    """Geometric mean of a pixel's sides on the ground, metres, at (x, y) of the CRS."""
-    across_m = ground_distance_m(crs, (x - 50 * pixel_x, y), (x + 50 * pixel_x, y)) / 100
-    down_m = ground_distance_m(crs, (x, y - 50 * pixel_y), (x, y + 50 * pixel_y)) / 100
-    return math.sqrt(across_m * down_m)
-
-
-def ground_distance_m(crs: CRS, a: tuple[float, float], b: tuple[float, float]) -> float:
-    lon_deg, lat_deg = Transformer.from_crs(crs, 4326, always_xy=True).transform([a[0], b[0]], [a[1], b[1]])
-    return float(Geod(ellps="WGS84").inv(lon_deg[0], lat_deg[0], lon_deg[1], lat_deg[1])[2])
 
 
 def _check_place(dataset: Any, crs: CRS, path: Path) -> None:

@@ -24,7 +24,6 @@ ELLIPSE_SPACING = 1.1  # spacing of ellipses in units of their length, so that t
 MIN_SPACING_PX = 24.0
 MIN_STEP_PX = 0.7  # of a track
 SCALE_BAR_SHARE = 0.22  # largest length, as a share of the image width
-LABELS = ("satellite_anchored", "visual_propagated", "dead_reckoned")
 
 
 @dataclass(frozen=True)

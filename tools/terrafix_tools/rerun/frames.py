@@ -18,12 +18,12 @@ from terrafix.messages import (
     Health,
     Imu,
     Message,
-    Origin,
     PositionHint,
     VehicleState,
 )
 from terrafix.recorder.reader import FrameImage, ReadResult, read_with_images
 from terrafix.vision.sources import Shot
+from terrafix.vision.sources.contract import SourceBase
 from terrafix_tools.log.edit import origin_of
 
 ALL_FRAMES = "all"  # of [recorder] frames
@@ -32,10 +32,8 @@ OTHERS = (EkfDeadReckoning, GimbalAttitude, GnssInitialPosition, Health, Positio
 NOT_RECORDED = "the record does not have the pixels of this frame"
 
 
-class RecordedFrames:
+class RecordedFrames(SourceBase):
     """A Source. Raises SourceError for a record without all frames at full size."""
-
-    live = False
 
     def __init__(self, record: Path) -> None:
         self.record = record
@@ -49,12 +47,6 @@ class RecordedFrames:
                 f'its messages, without --frames, or record the next flight with frames = "{ALL_FRAMES}"'
             )
 
-    def origin(self) -> Origin:
-        return self._origin
-
-    def length(self) -> int | None:
-        return None
-
     def name(self) -> str:
         return self.record.resolve().name
 
@@ -64,9 +56,6 @@ class RecordedFrames:
 
     def facts(self) -> list[Fact]:
         return [Fact(*fact) for fact in self.header.get("source", [])]
-
-    def close(self) -> None:
-        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         """A frame waits for its pixels, which are recorded after it, until those of a later frame arrive."""

@@ -10,9 +10,9 @@ from terrafix.core import logs
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
 from terrafix.core.passwords import without_password
-from terrafix.messages import STAMP_SIGMA_S, Camera, Fact, Frame, Origin
+from terrafix.messages import STAMP_SIGMA_S, Camera, Fact, Frame
 from terrafix.vision.sources.capture import Capture, Stamp, open_device, open_stream
-from terrafix.vision.sources.contract import UNKNOWN_TIMING, Shot, Timing
+from terrafix.vision.sources.contract import UNKNOWN_TIMING, Shot, SourceBase, Timing
 from terrafix.vision.sources.description import camera_of, origin_of, read_description
 from terrafix.vision.sources.facts import camera_facts, mount_fact, start_fact
 from terrafix.vision.sources.gst import GstCapture, gstreamer
@@ -25,7 +25,7 @@ RECONNECT_S = 1.0  # a USB camera needs about this long to re-enumerate
 MAX_LATE_NS = 2_000_000_000
 
 
-class LiveCamera:
+class LiveCamera(SourceBase):
     """Frames with ``t_ns`` on the monotonic clock: the driver's timestamp if there is one, else the time of arrival;
     the stated latency is taken off."""
 
@@ -69,17 +69,8 @@ class LiveCamera:
         if self._capture is not None and not wait:
             self._check_size(self._capture)
 
-    def origin(self) -> Origin:
-        return self._origin
-
-    def length(self) -> int | None:
-        return None
-
     def name(self) -> str:
         return self._description.name or self._shown
-
-    def map_hint(self) -> Path | None:
-        return None
 
     def facts(self) -> list[Fact]:
         camera, described = self._origin.camera, self._described.name

@@ -76,6 +76,47 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
+class SourceBase:
+    """What most sources are: recordings of an ``_origin``, of unknown length, which name no map."""
+
+    live = False
+    _origin: Origin
+
+    def origin(self) -> Origin:
+        return self._origin
+
+    def length(self) -> int | None:
+        return None
+
+    def map_hint(self) -> Path | None:
+        return None
+
+    def close(self) -> None:
+        """No resource stays open between shots."""
+
+
+class WrappedSource:
+    """All of another source but its shots."""
+
+    def __init__(self, source: Source) -> None:
+        self.live, self._source = source.live, source
+
+    def origin(self) -> Origin:
+        return self._source.origin()
+
+    def length(self) -> int | None:
+        return self._source.length()
+
+    def map_hint(self) -> Path | None:
+        return self._source.map_hint()
+
+    def name(self) -> str:
+        return self._source.name()
+
+    def close(self) -> None:
+        self._source.close()
+
+
 @runtime_checkable
 class WithTruth(Protocol):
     """A source whose file also has positions, which nothing reads but ``terrafix source truth``."""

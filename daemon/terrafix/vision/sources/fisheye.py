@@ -2,14 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 
 from terrafix.messages import Camera, Fact, Origin
-from terrafix.vision.sources.contract import Shot, Source, truth_of
+from terrafix.vision.sources.contract import Shot, Source, WrappedSource, truth_of
 from terrafix.vision.sources.facts import facts_of
 
 # Off the axis; there a pixel sees three times the ground of one in the middle (1 / cos^2) [spec: geometry]
@@ -63,12 +62,12 @@ def view_of(camera: Camera) -> Camera:
     )
 
 
-class FisheyeView:
+class FisheyeView(WrappedSource):
     """A source with the views of another's images (``Source``). The grid of the view is computed once."""
 
     def __init__(self, source: Source, camera: FisheyeCamera) -> None:
-        self.live = source.live
-        self._source, self._camera = source, view_of(camera)
+        super().__init__(source)
+        self._camera = view_of(camera)
         view, size = self._camera, (self._camera.width, self._camera.height)
         self._grid = cv2.fisheye.initUndistortRectifyMap(
             _matrix(camera), np.array(camera.distortion), np.eye(3), _matrix(view), size, cv2.CV_16SC2
@@ -77,29 +76,17 @@ class FisheyeView:
     def origin(self) -> Origin:
         return msgspec.structs.replace(self._source.origin(), camera=self._camera)
 
-    def length(self) -> int | None:
-        return self._source.length()
-
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         for shot in self._source.shots(from_s):
             frame = msgspec.structs.replace(shot.frame, width=self._camera.width, height=self._camera.height)
             image = None if shot.image is None else cv2.remap(shot.image, *self._grid, cv2.INTER_LINEAR)
             yield replace(shot, frame=frame, image=image)
 
-    def map_hint(self) -> Path | None:
-        return self._source.map_hint()
-
-    def name(self) -> str:
-        return self._source.name()
-
     def facts(self) -> list[Fact]:
         return [*facts_of(self._source), *view_facts(self._source.origin().camera)]
 
     def truth(self) -> list[tuple[str, float, float]]:
         return truth_of(self._source)
-
-    def close(self) -> None:
-        self._source.close()
 
 
 def view_facts(camera: Camera) -> list[Fact]:

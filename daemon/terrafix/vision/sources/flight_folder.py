@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, Origin, VehicleState
-from terrafix.vision.sources.contract import Shot, TelemetryCursor
+from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, VehicleState
+from terrafix.vision.sources.contract import Shot, SourceBase, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
 from terrafix.vision.sources.exposed import exposed_times
 from terrafix.vision.sources.facts import camera_facts, log_facts, mount_fact, rate_facts, start_fact, telemetry_facts
@@ -18,10 +18,8 @@ from terrafix.vision.sources.plausible import check_heights
 from terrafix.vision.sources.table import Row, read_table
 
 
-class FlightFolder:
+class FlightFolder(SourceBase):
     """Validates everything except the pixels when it is opened, so that errors are found before the flight."""
-
-    live = False
 
     def __init__(self, folder: Path, start: tuple[float, float] | None = None) -> None:
         self.folder = folder
@@ -52,9 +50,6 @@ class FlightFolder:
         self._imu: list[Imu] = [] if self._log is None else self._log.imu
         self._gimbal: list[GimbalAttitude] = [] if self._log is None else self._log.gimbal
 
-    def origin(self) -> Origin:
-        return self._origin
-
     def length(self) -> int | None:
         return len(self._rows)
 
@@ -81,9 +76,6 @@ class FlightFolder:
         if outside and outside == len(self._states):
             found.append(Fact("left out", "all telemetry: none of it lies within the times of the frames"))
         return found
-
-    def close(self) -> None:
-        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         from_ns = round(from_s * 1e9)

@@ -15,7 +15,7 @@ import msgspec
 
 from terrafix.core.errors import SourceError
 from terrafix.messages import Camera, Fact, Frame, Origin, VehicleState
-from terrafix.vision.sources.contract import Shot
+from terrafix.vision.sources.contract import Shot, SourceBase
 from terrafix.vision.sources.description import Description, StartTable, camera_of, origin_of, read_description
 from terrafix.vision.sources.exif import PhotoInfo, read_info
 from terrafix.vision.sources.facts import camera_facts, mount_fact, rate_facts, start_fact, telemetry_facts
@@ -39,10 +39,8 @@ UNTIMED_STEP_S = 1.0  # photos without times: ordered by name, one per second
 EXIF_STEP_S = 1.0  # resolution of an EXIF time without SubSecTime
 
 
-class Photos:
+class Photos(SourceBase):
     """Photos ordered by time, then name. The GPS coordinate of the first one serves as initial position, no other."""
-
-    live = False
 
     def __init__(self, folder: Path, start: tuple[float, float] | None = None, camera: Path | None = None) -> None:
         self.folder = folder
@@ -68,9 +66,6 @@ class Photos:
         self._apart_deg = yaws_apart_deg(infos)
         self._origin = self._make_origin(first, downscaled_camera(self._stored), start)
         self._start_given = start is not None
-
-    def origin(self) -> Origin:
-        return self._origin
 
     @property
     def stored(self) -> Camera:
@@ -131,9 +126,6 @@ class Photos:
         if others:
             more = f" and {len(others) - MAX_NAMED} more" if len(others) > MAX_NAMED else ""
             yield Fact("left out", f"files that are no photos: {', '.join(others[:MAX_NAMED])}{more}")
-
-    def close(self) -> None:
-        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         camera, stored = self._origin.camera, self._stored

@@ -18,11 +18,11 @@ from terrafix.core.errors import SourceError
 from terrafix.core.geodesy import euler_from_rot, rot_from_quat
 from terrafix.core.mavlink.gimbal import AT_A_LIMIT, MAX_NORM_ERROR, yaw_is_from_north
 from terrafix.core.mavlink.vehicles import HeardVehicle
-from terrafix.messages import Camera, Fact, Frame, GimbalAttitude, Imu, Origin, Quat, VehicleState
+from terrafix.messages import Camera, Fact, Frame, GimbalAttitude, Imu, Quat, VehicleState
 from terrafix.vision.sources.bag_reader import BagReader
 from terrafix.vision.sources.bag_topics import COMPRESSED, choose_topics
 from terrafix.vision.sources.camera_info import camera_of_info
-from terrafix.vision.sources.contract import Shot, TelemetryCursor
+from terrafix.vision.sources.contract import Shot, SourceBase, TelemetryCursor
 from terrafix.vision.sources.description import Description, camera_of, origin_of, read_description, with_mount
 from terrafix.vision.sources.facts import camera_facts, log_facts, mount_fact, rate_facts, start_fact, telemetry_facts
 from terrafix.vision.sources.images import WRONG_SIZE, decode_image, downscale_factor, downscaled_camera
@@ -61,11 +61,9 @@ class BagTelemetry:
         return self.said
 
 
-class RosBag:
+class RosBag(SourceBase):
     """Takes ``rate_hz`` images per second. ``topics``: by kind (``bag_topics``). Camera: [camera] of BAG.toml or
     flight.toml beside the bag, or of ``camera``; else CameraInfo. Raises SourceError."""
-
-    live = False
 
     def __init__(
         self,
@@ -87,9 +85,6 @@ class RosBag:
         self._log.said += notes
         check_heights(path, [s.agl_m for s in self._log.states if s.agl_m is not None], self._topics.get("height", ""))
         self._origin = origin_of(self._description, downscaled_camera(self._stored), start)
-
-    def origin(self) -> Origin:
-        return self._origin
 
     def length(self) -> int | None:
         return len(self._taken())
@@ -118,9 +113,6 @@ class RosBag:
         if "truth" in self._topics:
             found.append(Fact("left out", f"{self._topics['truth']} is truth: terrafix source truth writes it"))
         return found
-
-    def close(self) -> None:
-        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         from_ns, camera = round(from_s * 1e9), self._origin.camera

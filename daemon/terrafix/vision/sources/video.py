@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 
 from terrafix.core.errors import SourceError
-from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, Origin, VehicleState
-from terrafix.vision.sources.contract import Shot, TelemetryCursor
+from terrafix.messages import Fact, Frame, GimbalAttitude, Imu, VehicleState
+from terrafix.vision.sources.contract import Shot, SourceBase, TelemetryCursor
 from terrafix.vision.sources.description import camera_of, origin_of, read_description, telemetry_log
 from terrafix.vision.sources.facts import camera_facts, log_facts, mount_fact, start_fact, telemetry_facts
 from terrafix.vision.sources.gpmf import read_gpmf
@@ -20,10 +20,8 @@ from terrafix.vision.sources.table import read_table
 FFMPEG_QUIET = "-8"  # AV_LOG_QUIET; a damaged image would otherwise print one line per block
 
 
-class Video:
+class Video(SourceBase):
     """Takes ``rate_hz`` images per second. Times are those of the container; frame ids count the images taken."""
-
-    live = False
 
     def __init__(
         self,
@@ -56,9 +54,6 @@ class Video:
                 f"{path}: the video is {size[0]}x{size[1]}, [camera] in {where} says "
                 f"{expected.width}x{expected.height}; describe the camera in pixels of this video"
             )
-
-    def origin(self) -> Origin:
-        return self._origin
 
     def length(self) -> int | None:
         if not (self._fps > 0 and self._frames > 0):
@@ -95,9 +90,6 @@ class Video:
         if self._gopro is None or not self._gopro.fixes:
             raise SourceError(f"{self.path}: has no positions of a GoPro that could be the truth")
         return positions_at(((shot.frame.file, shot.frame.t_ns) for shot in self.shots()), self._gopro.fixes)
-
-    def close(self) -> None:
-        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         capture = self._open()

@@ -13,7 +13,7 @@ from terrafix.core.inertial import GRAVITY_MPS2
 from terrafix.estimator.measurements.ekf_dead_reckoning import MAX_AHEAD_S, DeadReckoning
 from terrafix.estimator.models.motion_model import TILT_CORRELATION_S, TILT_VARYING_SHARE
 from terrafix.estimator.node import EstimatorNode
-from terrafix.estimator.prior import CheckpointWriter, EstimatorCheckpoint, load_checkpoint
+from terrafix.estimator.prior import EstimatorCheckpoint
 from terrafix.messages import (
     CovarianceMode,
     EkfDeadReckoning,
@@ -36,10 +36,7 @@ def flight() -> Flight:
 
 @pytest.fixture(scope="module")
 def killed(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> EstimatorCheckpoint:
-    keeper = CheckpointWriter(file := tmp_path_factory.mktemp("run") / "estimator.checkpoint")
-    for message in [flight.fix(KILLED - 2), *EstimatorRun().fly(flight, 0, KILLED).published]:
-        keeper.on_message(message)
-    last = load_checkpoint(file)
+    last = EstimatorRun().checkpoint(flight, KILLED, tmp_path_factory.mktemp("run"))
     assert last is not None
     return last
 

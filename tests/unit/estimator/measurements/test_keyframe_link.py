@@ -19,7 +19,7 @@ from terrafix.core.gate import GATE
 from terrafix.estimator.graph.pose_graph import NewNode, PoseGraph
 from terrafix.messages import Health, KeyframeLink, MapMatch, Message, Odometry, ThermalBand, Verdict
 
-FRAMES, MAP_UNTIL, LAST = 30, 4, 29
+FRAMES, MAP_UNTIL = 30, 4
 
 
 def link(flight: Flight, keyframe: int, i: int, *, shown: int | None = None) -> KeyframeLink:

@@ -16,7 +16,7 @@ from terrafix.core.geodesy import LocalFrame
 from terrafix.link.autopilot.ekf_dead_reckoning import EkfState, LastFix, _dead_reckoning_since
 from terrafix.messages import EkfDeadReckoning, GpsInput, Message
 
-S, MS = 1_000_000_000, 1_000_000
+S = 1_000_000_000
 GPS_ID = 1
 PLACE = LocalFrame(48.0, 11.0)
 HEALTHY_FLAGS = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_POS_HORIZ_REL

@@ -1,6 +1,5 @@
 """Monte Carlo flights with false inputs: times and sizes of each."""
 
-import math
 from dataclasses import replace
 
 import msgspec
@@ -8,15 +7,12 @@ import numpy as np
 import pytest
 
 from terrafix.messages import MapMatch, Prediction, SearchStep, Verdict
-from terrafix_lab.faults.edits import Span
 from terrafix_lab.montecarlo import lies as of
 from terrafix_lab.montecarlo.fault import LIES, DrawnFault
-from terrafix_lab.montecarlo.flight import Record
 from terrafix_lab.montecarlo.flown import Shot, SimulatedFlight, fly
 from terrafix_lab.montecarlo.ground import Terrain
 from terrafix_lab.montecarlo.lies import Lies, Search
 from terrafix_lab.montecarlo.plan import FlightPlan, plan
-from terrafix_lab.montecarlo.statistics import FlightResult
 
 SHORT_S = 60.0
 FOUND = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", inliers=20)
@@ -154,31 +150,3 @@ def test_frames_without_a_picture_are_no_evidence_against_the_position() -> None
     assert all(search.update(dark, PREDICTION, shot, always(dark)) == dark for _ in range(4 * of.LOST_FRAMES))
     matches = [search.update(NOTHING, PREDICTION, shot, always(NOTHING)) for _ in range(of.LOST_FRAMES)]
     assert [m.verdict is Verdict.LOST for m in matches].index(True) == of.LOST_FRAMES - 1
-
-
-def judged(lie_from_s: float | None, false_at: list[int]) -> FlightResult:
-    """A flight of 40 frames, one a second, false at some."""
-    n = 40
-    error = np.zeros((n, 6))
-    error[false_at, 0] = 80.0
-    cov = np.tile(np.eye(6), (n, 1, 1))
-    record = Record(
-        plan=plan(1, 0), t_s=np.arange(n, dtype=float), path_m=np.zeros(n),
-        truth_m=np.zeros((n, 2)), error_m=error, cov=cov, velocity_error_mps=np.zeros((n, 3)),
-        velocity_sigma_mps=np.ones(n), anchor_age_ms=np.full(n, -1), refined_error_m=np.zeros((n, 2)),
-        refined_sigma_m=np.ones((n, 2)), cpu_ms=np.zeros(n),
-        lie=None if lie_from_s is None else Span(lie_from_s, math.inf, ""))  # fmt: skip
-    return FlightResult.of(record)
-
-
-def test_time_to_notice_ends_at_the_last_false_fix_after_the_start_of_the_false_input() -> None:
-    assert judged(10.0, [12, 13]).notice_s == 3.0
-    assert judged(10.0, [4]).notice_s is None and judged(10.0, []).notice_s is None
-    assert judged(None, [12]).notice_s is None
-
-
-def test_false_fixes_are_late_after_three_seconds_and_five_frames() -> None:
-    assert judged(10.0, [10, 13, 14]).late_false_fixes == 0  # the fifth frame is that of 14 s
-    assert judged(10.0, [14, 15, 30]).late_false_fixes == 2
-    assert judged(10.0, [9]).late_false_fixes == 1  # before the lie
-    assert judged(None, [0, 1]).late_false_fixes == 2

@@ -25,12 +25,11 @@ FAR_SIGMAS = 3.0  # beyond which a neighbour does not count [spec: Gaussian weig
 class Residuals:
     """Matched points of one frame with the pose of the match: ``map_m`` (N, 2) on the map, east and north; ``off_m``
     (N, 2): map point less the ground that the pose sees there; ``px`` (N,): the same as a length in the frame;
-    ``outward`` (N, 2): unit vector away from the camera; ``height_m``: of the camera above the points."""
+    ``height_m``: of the camera above the points."""
 
     map_m: np.ndarray
     off_m: np.ndarray
     px: np.ndarray
-    outward: np.ndarray
     height_m: float
 
 
@@ -43,9 +42,7 @@ def residuals(match: MapMatch, focal_px: float) -> Residuals:
     px = np.linalg.norm(in_c[:, :2] / in_c[:, 2:] - points[:, :2], axis=1) * focal_px
     rays = np.column_stack([points[:, :2], np.ones(len(points))]) @ r_w_c.T
     seen_m = p_m[:2] + rays[:, :2] * ((points[:, 4] - p_m[2]) / rays[:, 2])[:, None]
-    outward = points[:, 2:4] - p_m[:2]
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    return Residuals(points[:, 2:4], points[:, 2:4] - seen_m, px, outward, float(p_m[2] - np.median(points[:, 4])))
+    return Residuals(points[:, 2:4], points[:, 2:4] - seen_m, px, float(p_m[2] - np.median(points[:, 4])))
 
 
 def left_by_local_model(frames: Sequence[Residuals]) -> list[np.ndarray]:

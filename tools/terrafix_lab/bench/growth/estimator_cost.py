@@ -28,7 +28,6 @@ from terrafix_lab.bench.growth.stream import frame_messages, origin
 from terrafix_tools.replay import peak_memory_mb
 from terrafix_tools.timing import spread
 
-RESULT = "growth.json"
 LAST = 80  # last frames of the flight, for the statistics of the time per frame
 LATER = 500  # last frames for the statistics of the graph alone: more, for the 99th percentile
 QUERIES = 10  # covariance queries from scratch

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from terrafix.core.frames import MemoryFrameStore
-from terrafix.core.node import Image, Node, NodeContext
+from terrafix.core.node import Image, Node, NodeBase, NodeContext
 from terrafix.link.edge import MavlinkEdge
 from terrafix.link.mavlink.transport import Transport
 from terrafix.messages import (
@@ -41,7 +41,7 @@ class Delays:
     anchor_s: float = 0.20  # from there to the estimate with the map match
 
 
-class DelayedNode:
+class DelayedNode(NodeBase):
     """A node whose outputs are delayed. Of the predictions that arrive while it is busy only the newest is processed,
     as in runtime/inbox.py.
     """
@@ -61,9 +61,6 @@ class DelayedNode:
         self._waiting = message
         self._start_next()
         return []
-
-    def tick(self, now_ns: int) -> Iterable[Message]:
-        return ()
 
     def ready_outputs(self) -> list[Message]:
         """Returns the outputs that are ready at ``now_ns``."""

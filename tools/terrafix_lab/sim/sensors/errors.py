@@ -44,9 +44,6 @@ class SensorErrors:
     baro_noise_m: float = 0.12
     airspeed_scale: float = 0.02
     airspeed_noise_mps: float = 0.25
-    range_noise_m: float = 0.05
-    range_limits_m: tuple[float, float] = (0.2, 60.0)
-    range_dropout: float = 0.02  # share of invalid readings
 
 
 TYPICAL = SensorErrors()

@@ -18,7 +18,7 @@ from terrafix_lab.sim.vehicle.motion import GRAVITY_MPS2
 
 BLOCK = 512  # number of samples for which random numbers are drawn at once
 AIRBORNE_M = 0.5  # height above which the motors run
-GYRO, ACCEL, GYRO_WALK, ACCEL_WALK, ATTITUDE, YAW, BARO, BARO_WALK, AIR, RANGE = (
+GYRO, ACCEL, GYRO_WALK, ACCEL_WALK, ATTITUDE, YAW, BARO, BARO_WALK, AIR = (
     slice(0, 3),
     slice(3, 6),
     slice(6, 9),
@@ -28,15 +28,12 @@ GYRO, ACCEL, GYRO_WALK, ACCEL_WALK, ATTITUDE, YAW, BARO, BARO_WALK, AIR, RANGE =
     15,
     16,
     17,
-    18,
 )
-DRAWS = 19
+DRAWS = 19  # of a step; another number gives other flights of a seed
 
 
 class VehicleSensors:
-    """Call ``read`` once for every state, in order of time. ``airspeed``, ``rangefinder``: whether the vehicle has
-    them.
-    """
+    """Call ``read`` once for every state, in order of time. ``airspeed``: whether the vehicle measures it."""
 
     def __init__(
         self,
@@ -46,12 +43,11 @@ class VehicleSensors:
         errors: SensorErrors = TYPICAL,
         events: Sequence[AnyEvent] = (),
         airspeed: bool = True,
-        rangefinder: bool = False,
         mount: CameraMount = FIXED,
     ) -> None:
         rng = np.random.default_rng([seed, 31])
         self._noise = np.random.default_rng([seed, 32])
-        self._errors, self._has_airspeed, self._has_range, self._mount = errors, airspeed, rangefinder, mount
+        self._errors, self._has_airspeed, self._mount = errors, airspeed, mount
         self._gnss = Gnss(frame, seed=seed, events=events)
         self._gyro_bias = rng.normal(0.0, 1.0, 3) * errors.gyro_bias_radps
         self._accel_bias = rng.normal(0.0, 1.0, 3) * errors.accel_bias_mps2
@@ -94,7 +90,6 @@ class VehicleSensors:
             roll_rad=state.roll_rad + roll_error,
             baro_amsl_m=self._baro(state, float(draws[BARO]), float(draws[BARO_WALK]) * root),
             airspeed_mps=self._airspeed(state, float(draws[AIR])),
-            range_m=self._range(state, float(draws[RANGE])),
             gnss=self._gnss.read(state),
             gimbal=self._mount.reported(state),
         )
@@ -138,15 +133,3 @@ class VehicleSensors:
         if not self._has_airspeed:
             return None
         return max(0.0, state.airspeed_mps * self._air_scale + self._errors.airspeed_noise_mps * draw)
-
-    def _range(self, state: State, draw: float) -> float | None:
-        """Distance along the body's down axis over level ground."""
-        if not self._has_range:
-            return None
-        near_m, far_m = self._errors.range_limits_m
-        down = math.cos(state.pitch_rad) * math.cos(state.roll_rad)
-        dropout = abs(math.remainder(7919.0 * draw, 1.0)) * 2.0 < self._errors.range_dropout
-        if down < 0.5 or dropout:
-            return None
-        range_m = state.agl_m / down + self._errors.range_noise_m * draw
-        return range_m if near_m <= range_m <= far_m else None

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from terrafix.core.errors import SourceError, TerrafixError
-from terrafix.messages import Message, Origin
+from terrafix.messages import Message
 from terrafix.runtime.fork_server import set_parent_death_signal
 from terrafix.vision.sources import Shot
+from terrafix.vision.sources.contract import SourceBase
 from terrafix_tools.console.compute.limits import MEMORY_BYTES
 from terrafix_tools.console.compute.packets import Begin, Done, Failed, NextUpload, pack, step_of, to_program
 from terrafix_tools.console.compute.source import Upload
@@ -24,28 +25,14 @@ from terrafix_tools.parallel.remote_program import PACKET_BYTES, connection_of
 from terrafix_tools.replay import replay
 
 
-class RemoteImages:
+class RemoteImages(SourceBase):
     """A Source: the images of a flight, as its process names them."""
 
-    live = False
-
     def __init__(self, connection: "Connection[Any, Any]", begin: Begin) -> None:
-        self._connection, self._begin = connection, begin
-
-    def origin(self) -> Origin:
-        return self._begin.origin
-
-    def length(self) -> int | None:
-        return None
+        self._connection, self._begin, self._origin = connection, begin, begin.origin
 
     def name(self) -> str:
         return self._begin.name
-
-    def map_hint(self) -> Path | None:
-        return None
-
-    def close(self) -> None:
-        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         while True:

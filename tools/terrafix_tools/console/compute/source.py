@@ -5,8 +5,9 @@ from pathlib import Path
 
 import msgspec
 
-from terrafix.messages import Frame, Origin, PositionHint, VehicleState
+from terrafix.messages import Frame, PositionHint, VehicleState
 from terrafix.vision.sources import Shot
+from terrafix.vision.sources.contract import SourceBase
 from terrafix.vision.sources.description import ATTITUDE_SIGMA_DEG
 from terrafix.vision.sources.images import read_image
 from terrafix.vision.sources.photos import STATED_TILT_SIGMA_DEG
@@ -39,11 +40,9 @@ class Upload(msgspec.Struct, frozen=True, tag=True):
         return Shot(msgspec.structs.replace(self.frame, error=error), states, pixels, others=self.hints)
 
 
-class UploadedImages:
+class UploadedImages(SourceBase):
     """A Source. ``wait`` blocks until something may have changed; ``begins`` gets each frame before it is read;
     ``steer(hint_id, given, t_ns)`` makes the message of a hint, None: it cannot be used."""
-
-    live = False
 
     def __init__(
         self,
@@ -66,20 +65,8 @@ class UploadedImages:
         self._origin = msgspec.structs.replace(stated, flight_id=flight_id)
         self.stored = stored_camera(self.new)
 
-    def origin(self) -> Origin:
-        return self._origin
-
-    def length(self) -> int | None:
-        return None
-
     def name(self) -> str:
         return self.new.name or self._flight_id
-
-    def map_hint(self) -> Path | None:
-        return None
-
-    def close(self) -> None:
-        """No resource stays open between shots."""
 
     def shots(self, from_s: float = 0.0) -> Iterator[Shot]:
         for upload in self.uploads():

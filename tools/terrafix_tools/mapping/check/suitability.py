@@ -90,7 +90,6 @@ class CheckResult:
     grid: SightGrid
     local: LocalMap
     route: MissionRoute | None
-    route_sight: np.ndarray | None
 
 
 def check(
@@ -153,7 +152,7 @@ def check(
         ],
         mission=mission_check,
     )
-    return CheckResult(report, grid, local, route, route_sight)
+    return CheckResult(report, grid, local, route)
 
 
 def _flight_height_m(agl_m: float | None, plan: Mission | None) -> float:

@@ -11,7 +11,7 @@ import rasterio
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from terrafix_tools.mapping.layers import Imagery
+from terrafix_tools.mapping.imagery import Imagery
 
 BLOCK_PX = 2048  # side of the blocks that are labelled one at a time
 SIDES = ((-1, 0), (1, 0), (0, -1), (0, 1))  # left, right, above, below a block

@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 
 import cv2
 import numpy as np
@@ -12,10 +11,9 @@ from rasterio.transform import Affine
 
 from terrafix.map.format import InputStatement
 from terrafix_tools.mapping.area.polygons import Area, Placed
-from terrafix_tools.mapping.layers import Imagery
+from terrafix_tools.mapping.imagery import Imagery
 from terrafix_tools.mapping.mosaic.grid import Grid
 from terrafix_tools.mapping.mosaic.warp import Warped
-from terrafix_tools.mapping.source import ground_pixel_m
 
 Opener = Callable[[], Imagery]
 
@@ -29,17 +27,15 @@ class MosaicPlan:
     parts: tuple[Opener, ...]
 
 
-class Mosaic:
-    """Implements Imagery. A context manager."""
-
-    has_mask = True
+class Mosaic(Imagery):
+    """Its grid is that of the plan."""
 
     def __init__(self, plan: MosaicPlan) -> None:
         grid = plan.grid
         self.crs = CRS.from_user_input(grid.crs)
         self.width_px, self.height_px = grid.width_px, grid.height_px
         self.pixel_x, self.pixel_y = grid.pixel_x, grid.pixel_y
-        self.x_min, self.y_max, self.bounds = grid.x_min, grid.y_max, grid.bounds
+        self.x_min, self.y_max = grid.x_min, grid.y_max
         self._placed = Placed(plan.area, self.crs)
         self._open = contextlib.ExitStack()
         with self._open:  # closes the open sources when a later one fails to open
@@ -47,23 +43,12 @@ class Mosaic:
             self._parts = [Warped(part, grid, self.crs) for part in self._sources]
             self._open = self._open.pop_all()
 
-    def __enter__(self) -> "Mosaic":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self._open.close()
 
     @property
     def statements(self) -> tuple[InputStatement, ...]:
         return tuple(statement for part in self._sources for statement in part.statements)
-
-    @property
-    def gsd_m(self) -> float:
-        """Ground metres per pixel at the centre."""
-        x_min, y_min, x_max, y_max = self.bounds
-        return ground_pixel_m(self.crs, (x_min + x_max) / 2, (y_min + y_max) / 2, self.pixel_x, self.pixel_y)
 
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
         """A window inside the mosaic: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255."""

@@ -9,7 +9,7 @@ from pyproj import CRS, Transformer
 
 from terrafix.core.errors import MapError
 from terrafix_tools.mapping.area.polygons import Area, Placed
-from terrafix_tools.mapping.layers import Bounds, Imagery
+from terrafix_tools.mapping.imagery import Bounds, Imagery
 
 SLIVER_PX = 0.01
 RESOLUTION_TOLERANCE = 1.05  # no resampling when the requested resolution is within this factor of the source's

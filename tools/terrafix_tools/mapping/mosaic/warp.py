@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from pyproj import CRS, Transformer
 
-from terrafix_tools.mapping.layers import Imagery
+from terrafix_tools.mapping.imagery import Imagery
 from terrafix_tools.mapping.mosaic.grid import Grid
 
 AGREE_PX = 0.01  # grids whose pixels differ by less than this are the same

@@ -20,11 +20,12 @@ from terrafix.core.errors import MapError
 from terrafix.map.format import DEM_NULL, DEM_TILE_PX, DemGrid, Level
 from terrafix_tools.mapping.choices import Datum, Unit
 from terrafix_tools.mapping.datum import crs_of
-from terrafix_tools.mapping.layers import Bounds, Elevation, ElevationInput
+from terrafix_tools.mapping.imagery import Bounds, ground_distance_m, ground_pixel_m
+from terrafix_tools.mapping.layers import Elevation, ElevationInput
 from terrafix_tools.mapping.package.gpkg import GpkgWriter
 from terrafix_tools.mapping.package.height_values import check_amsl, height_statement, heights_of
 from terrafix_tools.mapping.package.pyramid import Place
-from terrafix_tools.mapping.source import SAMPLE_PX, ground_distance_m, ground_pixel_m, holds, open_raster
+from terrafix_tools.mapping.source import SAMPLE_PX, holds, open_raster
 
 PLAUSIBLE_M = (-500.0, 9000.0)  # the Dead Sea's shore is at -430 m, Everest at 8849 m; other values are voids
 FINEST_M = 1.0  # a finer grid adds megabytes without accuracy

@@ -29,7 +29,7 @@ from terrafix.map.format import (
     manifest_rows,
     tile_sha256,
 )
-from terrafix_tools.mapping.layers import Bounds
+from terrafix_tools.mapping.imagery import Bounds
 from terrafix_tools.mapping.package import gpkg_schema
 
 GPKG_VERSION = 10300  # requirement 2: user_version MMmmPP

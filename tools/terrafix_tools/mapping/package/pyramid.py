@@ -11,7 +11,7 @@ import numpy as np
 import rasterio
 
 from terrafix.map.format import TILE_PX, Level
-from terrafix_tools.mapping.layers import Imagery
+from terrafix_tools.mapping.imagery import Imagery
 from terrafix_tools.mapping.mosaic.collar import BLEED_PX, TRIM_PX, Collar
 from terrafix_tools.mapping.package.gpkg import GpkgWriter
 

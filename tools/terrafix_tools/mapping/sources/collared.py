@@ -7,8 +7,6 @@ import hashlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import rasterio
@@ -29,14 +27,9 @@ class Collared(ImagerySource):
         self._collar = Collar(collar_path)
         self.has_mask = True
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self._collar.close()
-        super().__exit__(kind, error, trace)
+        super().close()
 
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
         return read_without_collar(self, self._collar, column, row, width, height)

@@ -9,20 +9,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
 from pyproj import CRS, Transformer
 
-from terrafix.map.format import InputStatement
 from terrafix.map.vectors import wkb_parts
 from terrafix_tools.mapping.area.polygons import Area, Placed
+from terrafix_tools.mapping.imagery import Imagery
 from terrafix_tools.mapping.layers import Feature, LayerInput, VectorInput
 from terrafix_tools.mapping.mosaic.compositing import Mosaic, MosaicPlan
 from terrafix_tools.mapping.mosaic.grid import Grid
-from terrafix_tools.mapping.source import ground_pixel_m
 from terrafix_tools.mapping.sources.utm import utm_epsg
 
 GSD_M = 1.0  # metres per pixel: a lane of a road is three; finer pixels would be finer than the features' errors
@@ -118,33 +115,16 @@ def _width_m(attributes: Mapping[str, str]) -> float:
         return WIDTH_M.get(attributes.get("kind", "").removesuffix("_link"), OTHER_WIDTH_M)
 
 
-class Drawing:
-    """Implements Imagery: what ``spooled`` has written to ``folder``, on a grid. A context manager."""
-
-    has_mask = True
-    statements: tuple[InputStatement, ...] = ()
+class Drawing(Imagery):
+    """What ``spooled`` has written to ``folder``, on a grid."""
 
     def __init__(self, folder: Path, grid: Grid) -> None:
         self.crs = CRS.from_user_input(grid.crs)
         self.width_px, self.height_px = grid.width_px, grid.height_px
         self.pixel_x, self.pixel_y = grid.pixel_x, grid.pixel_y
-        self.x_min, self.y_max, self.bounds = grid.x_min, grid.y_max, grid.bounds
+        self.x_min, self.y_max = grid.x_min, grid.y_max
         self._strokes = _mapped(folder / STROKES_FILE, STROKE)
         self._points = _mapped(folder / POINTS_FILE, np.dtype("<f8")).reshape(-1, 2)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
-
-    @property
-    def gsd_m(self) -> float:
-        """Ground metres per pixel at the centre."""
-        x_min, y_min, x_max, y_max = self.bounds
-        return ground_pixel_m(self.crs, (x_min + x_max) / 2, (y_min + y_max) / 2, self.pixel_x, self.pixel_y)
 
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
         """A window inside the grid: (height, width, 3) uint8 and mask (height, width) uint8, 255 everywhere."""

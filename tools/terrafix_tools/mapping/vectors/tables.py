@@ -11,7 +11,8 @@ import numpy as np
 from terrafix.core.errors import MapError
 from terrafix.map.format import VectorTable
 from terrafix.map.vectors import features_sha256_of, wkb_parts
-from terrafix_tools.mapping.layers import Bounds, VectorInput
+from terrafix_tools.mapping.imagery import Bounds
+from terrafix_tools.mapping.layers import VectorInput
 from terrafix_tools.mapping.package import gpkg_schema
 from terrafix_tools.mapping.package.gpkg import WGS84, GpkgWriter
 

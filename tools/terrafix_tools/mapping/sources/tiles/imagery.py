@@ -2,7 +2,6 @@
 
 from collections import OrderedDict
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from terrafix.core.errors import MapError
 from terrafix.map.format import InputStatement
 from terrafix_tools.mapping.area.polygons import Placed
-from terrafix_tools.mapping.source import ground_pixel_m
+from terrafix_tools.mapping.imagery import Imagery
 from terrafix_tools.mapping.sources.tiles.grid import HALF_M, MERCATOR, Tile, tile_span_m, tiles_of
 from terrafix_tools.mapping.sources.tiles.image import TileDamage, decode
 
@@ -28,7 +27,7 @@ class TileReader(Protocol):
     def close(self) -> None: ...
 
 
-class TileImagery:
+class TileImagery(Imagery):
     """All tiles of ``zoom`` that touch an area, on the grid of EPSG:3857. A context manager."""
 
     def __init__(self, reader: TileReader, zoom: int, tile_px: int, placed: Placed) -> None:
@@ -42,8 +41,7 @@ class TileImagery:
         self.width_px, self.height_px = columns * tile_px, rows * tile_px
         self.pixel_x = self.pixel_y = span_m / tile_px
         self.x_min, self.y_max = tiles.column * span_m - HALF_M, HALF_M - tiles.row * span_m
-        self.has_mask = True
-        self.statements = (
+        self._statements = (
             InputStatement(
                 name=reader.path.name, kind="imagery", unit="metre", datum=MERCATOR.name, accuracy_m=0.0,
                 assumed=reader.notes,
@@ -51,24 +49,12 @@ class TileImagery:
         )  # fmt: skip
         self._decoded: OrderedDict[Tile, np.ndarray | None] = OrderedDict()
 
-    def __enter__(self) -> "TileImagery":
-        return self
+    @property
+    def statements(self) -> tuple[InputStatement, ...]:
+        return self._statements
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self._reader.close()
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, y_min, x_max, y_max in EPSG:3857."""
-        x_max = self.x_min + self.width_px * self.pixel_x
-        return self.x_min, self.y_max - self.height_px * self.pixel_y, x_max, self.y_max
-
-    @property
-    def gsd_m(self) -> float:
-        x_min, y_min, x_max, y_max = self.bounds
-        return ground_pixel_m(self.crs, (x_min + x_max) / 2, (y_min + y_max) / 2, self.pixel_x, self.pixel_y)
 
     def read(self, column: int, row: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
         """A window inside the image: (height, width, 3) uint8 BGR and mask (height, width) uint8 of 0 and 255.
