@@ -45,6 +45,7 @@ from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.evaluate import read_truth
 from terrafix_tools.flight_map import package_of
 from terrafix_tools.map_probe import reported_view
+from terrafix_tools.mapping.check.sight import YAW_SIGMA_RAD
 from terrafix_tools.mapping.package.null_model import FLIGHTS, STRETCHES, fit_null_row
 from terrafix_tools.models.known import as_model_errors
 from terrafix_tools.models.two_dates import CAMERA, TwoDates
@@ -53,7 +54,6 @@ GRADIENTS = "gradients"
 FALSE_ALARMS = 1e-3
 NEAR_M = 10.0
 APART = 0.25  # heights: two places within it are one, whose patches are the same
-KNOWN_YAW_SIGMA_RAD = math.radians(4.0)  # of a compass, for frames of two dates
 PRIOR_SIGMAS = 2.0  # largest distance of the truth from the centre of the prior, 1-sigmas
 WHOLE_MAP = math.inf
 SEED = 11
@@ -164,14 +164,14 @@ def ground_of(one: MatchSet, folder: Path, places: int) -> Ground:
         rng = np.random.default_rng(SEED)
         frames = []
         for true in dates.draw(places, one.agl_m, SEED):
-            yaw_rad = -true.heading_rad + rng.normal(0.0, KNOWN_YAW_SIGMA_RAD)
+            yaw_rad = -true.heading_rad + rng.normal(0.0, YAW_SIGMA_RAD)
             e_m, n_m = (float(v) for v in true.place_m)
             predicted = replace(
                 true.predicted,
                 e_m=e_m,
                 n_m=n_m,
                 r_w_c=local_rotation_up(yaw_rad) @ true.predicted.r_w_c,
-                yaw_sigma_rad=KNOWN_YAW_SIGMA_RAD,
+                yaw_sigma_rad=YAW_SIGMA_RAD,
             )
             frames.append(Frame(true.frame, predicted, NEAR_M))
         return Ground(source, CAMERA, frames)
