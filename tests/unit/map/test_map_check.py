@@ -84,6 +84,15 @@ def test_texture_is_matchable_and_water_and_orchard_rows_are_not(opened: MapPack
     assert probe.at(-520.0, 0.0) == Sight.NO_MAP  # half the frame is beyond the edge
 
 
+def test_faint_ground_is_placed_only_while_it_looks_as_on_the_map(tmp_path: Path) -> None:
+    faint = MapPackage.open(
+        build(map_rasters.utm(tmp_path / "i.tif", map_rasters.texture(300, 300)), tmp_path / "m.gpkg")
+    )
+    probe = probe_of(faint, centre_of(faint), 60.0)
+    assert [probe.at(e_m, 0.0) for e_m in (-15.0, 0.0, 15.0)] == [Sight.WEAK] * 3
+    faint.close()
+
+
 def test_the_check_grid_and_its_fractions(opened: MapPackage) -> None:
     checked = check(opened)
     report = checked.report

@@ -81,10 +81,18 @@ class _OneLayer:
 
 
 class MatchabilityProbe:
-    """Localizes frames of single places. ``lens``: taken for a pinhole; ``agl_m``: height above ground."""
+    """Localizes single frames. ``lens``: taken for a pinhole; ``agl_m``: height above ground; ``start_sigma_m``: of the
+    position from which a frame is placed."""
 
-    def __init__(self, local: LocalMap, layer: Layer, lens: CameraCalibration, agl_m: float) -> None:
-        self._local, self._agl_m = local, agl_m
+    def __init__(
+        self,
+        local: LocalMap,
+        layer: Layer,
+        lens: CameraCalibration,
+        agl_m: float,
+        start_sigma_m: float = START_SIGMA_M,
+    ) -> None:
+        self._local, self._agl_m, self._start_sigma_m = local, agl_m, start_sigma_m
         scale = min(MAX_FRAME_PX / max(lens.width, lens.height), 1.0)
         self._camera = Camera(
             width=round(lens.width * scale),
@@ -105,7 +113,7 @@ class MatchabilityProbe:
                 lat_deg=0.0,
                 lon_deg=0.0,
                 ground_amsl_m=0.0,
-                start_sigma_m=START_SIGMA_M,
+                start_sigma_m=start_sigma_m,
                 yaw_sigma_deg=math.degrees(YAW_SIGMA_RAD),
                 agl_sigma_m=HEIGHT_SIGMA * agl_m,
                 attitude_sigma_deg=math.degrees(TILT_SIGMA_RAD),
@@ -119,16 +127,17 @@ class MatchabilityProbe:
         frame = self._frame(e_m, n_m, yaw_rad, self._agl_m * (1.0 + rng.normal(0.0, HEIGHT_SIGMA)))
         if frame is None:
             return Sight.NO_MAP
-        prediction = self._prediction(np.array([e_m, n_m]) + rng.normal(0.0, START_SIGMA_M, 2), yaw_rad, rng)
+        prediction = self.prediction((e_m, n_m), yaw_rad, rng)
         noise = cv2.GaussianBlur(rng.normal(size=frame.shape[:2]).astype(np.float32), (0, 0), self._noise_sigma_px)
         noise = noise / noise.std()
         for sight, grey in ((Sight.SEES, CHANGED), (Sight.WEAK, AS_ON_THE_MAP)):
             changed = np.clip(frame + grey * noise[:, :, None], 0, 255).astype(np.uint8)
-            if self._is_placed(changed, prediction, (e_m, n_m)):
+            if self.is_placed(changed, prediction, (e_m, n_m)):
                 return sight
         return Sight.BLIND
 
-    def _is_placed(self, frame: Image, prediction: Prediction, place_m: tuple[float, float]) -> bool:
+    def is_placed(self, frame: Image, prediction: Prediction, place_m: tuple[float, float]) -> bool:
+        """Whether a frame, of ``lens`` at no more than MAX_FRAME_PX, has a match at its place (east, north)."""
         self._localizer.reset()
         self._localizer.predict(prediction)
         match = self._localizer.localize(prediction, frame)
@@ -136,10 +145,12 @@ class MatchabilityProbe:
             return False
         return math.dist((match.place.e_m, match.place.n_m), place_m) <= RIGHT * self._agl_m
 
-    def _prediction(self, at_m: np.ndarray, yaw_rad: float, rng: np.random.Generator) -> Prediction:
+    def prediction(self, place_m: tuple[float, float], yaw_rad: float, rng: np.random.Generator) -> Prediction:
+        """Of a frame at the place with a heading (counter-clockwise), with errors of start and compass."""
+        at_m = place_m + rng.normal(0.0, self._start_sigma_m, 2)
         r_w_c = local_rotation_up(yaw_rad + rng.normal(0.0, YAW_SIGMA_RAD)) @ NORTH_UP
         agl_sigma_m = HEIGHT_SIGMA * self._agl_m
-        sigmas = [START_SIGMA_M, START_SIGMA_M, agl_sigma_m, TILT_SIGMA_RAD, TILT_SIGMA_RAD, YAW_SIGMA_RAD]
+        sigmas = [self._start_sigma_m, self._start_sigma_m, agl_sigma_m, TILT_SIGMA_RAD, TILT_SIGMA_RAD, YAW_SIGMA_RAD]
         return Prediction(
             t_ns=0,
             frame_id=0,
