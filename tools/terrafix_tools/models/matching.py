@@ -71,10 +71,6 @@ class MatchSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     every: int = 1
 
 
-class MatchSets(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    set: list[MatchSet]
-
-
 @dataclass(frozen=True)
 class Frame:
     """``predicted``: at the true place, with the heading and height that are reported."""
@@ -151,8 +147,8 @@ def measure_matching(
 def read_sets(path: Path) -> list[MatchSet]:
     """The sets of a TOML list. Raises MapError."""
     try:
-        return msgspec.convert(read_toml(path), MatchSets).set
-    except (OSError, ValueError, msgspec.ValidationError) as error:
+        return msgspec.convert(read_toml(path), dict[str, list[MatchSet]])["set"]
+    except (OSError, KeyError, ValueError, msgspec.ValidationError) as error:
         raise MapError(f"{path}: no list of sets ({error}); docs/models.md shows one") from None
 
 
@@ -219,10 +215,7 @@ def _methods_on(
         belief_at = _prior(view, prior_m, ground.source, rng, matchers[GRADIENTS])
         for mirrored in (False, True):
             image = np.ascontiguousarray(frame.image[:, ::-1]) if mirrored else frame.image
-            seen = {
-                name: _correlated(name, one, matchers[name], image, view, belief_at())
-                for name, one in describers.items()
-            }
+            seen = {n: _correlated(n, one, matchers[n], image, view, belief_at()) for n, one in describers.items()}
             for name in names:
                 chosen = [seen[one] for one in name]
                 place = functools.partial(_place, image, view, chosen[-1][0], ground, matchers[GRADIENTS])

@@ -81,8 +81,6 @@ def _headline(report: MapCheck) -> str:
 
 def _colours() -> list[tuple[str, str]]:
     """CSS colour and meaning of each kind of ground."""
-    found = []
-    for sight, words in WORDS.items():
-        blue, green, red, alpha = COLOURS[sight]
-        found.append((f"rgba({red},{green},{blue},{alpha / 255:.2f})", words))
-    return found
+    bgra = [COLOURS[sight] for sight in WORDS]
+    css = (f"rgba({red},{green},{blue},{alpha / 255:.2f})" for blue, green, red, alpha in bgra)
+    return list(zip(css, WORDS.values(), strict=True))

@@ -85,31 +85,17 @@ class MatchabilityProbe:
     position from which a frame is placed."""
 
     def __init__(
-        self,
-        local: LocalMap,
-        layer: Layer,
-        lens: CameraCalibration,
-        agl_m: float,
-        start_sigma_m: float = START_SIGMA_M,
+        self, local: LocalMap, layer: Layer, lens: CameraCalibration, agl_m: float, start_sigma_m: float = START_SIGMA_M
     ) -> None:
         self._local, self._agl_m, self._start_sigma_m = local, agl_m, start_sigma_m
-        scale = min(MAX_FRAME_PX / max(lens.width, lens.height), 1.0)
-        self._camera = Camera(
-            width=round(lens.width * scale),
-            height=round(lens.height * scale),
-            fx=lens.fx * scale,
-            fy=lens.fy * scale,
-            cx=(lens.cx + 0.5) * scale - 0.5,
-            cy=(lens.cy + 0.5) * scale - 0.5,
-        )
-        seen = CameraCalibration.of(self._camera)
+        seen = self._camera = lens.scaled(min(MAX_FRAME_PX / max(lens.width, lens.height), 1.0))
         cell_m = FrameMatcher(seen, local, GradientDescriber()).correlation_cell_m(agl_m)
         self._noise_sigma_px = cell_m * seen.fx / agl_m
         self._localizer = Localizer(cast(Any, _OneLayer(local, layer)), GradientDescriber(), Map().ce90_m)
         self._localizer.begin_flight(
             Origin(
                 t_ns=0,
-                camera=self._camera,
+                camera=Camera(width=seen.width, height=seen.height, fx=seen.fx, fy=seen.fy, cx=seen.cx, cy=seen.cy),
                 lat_deg=0.0,
                 lon_deg=0.0,
                 ground_amsl_m=0.0,
