@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix_engines.onnx_file import TYPES, Shape, model, node, tensor, value
+from terrafix_engines.onnx_file import Shape, model, node, tensor, value
 
 
 def xfeat_like(nan: str = "never") -> bytes:
@@ -34,31 +34,6 @@ def xfeat_like(nan: str = "never") -> bytes:
         value(n, ["b", c, "h", "w"]) for n, c in (("descriptors", 64), ("keypoint_logits", 65), ("reliability", 1))
     ]
     return model(nodes, initializers, [value("input", ["batch", 3, "height", "width"])], outputs)
-
-
-def brightest_of_rows() -> bytes:
-    """-> a matcher of two images: for each row the brightest pixels of both, with the brightness in the first as
-    confidence."""
-    nodes, outputs = [], [value("mkpts0", ["n", 2]), value("mkpts1", ["n", 2]), value("mconf", ["n"])]
-    for k in "01":
-        nodes += [
-            node("ArgMax", [f"image{k}"], [f"where{k}"], axis=3, keepdims=0),
-            node("Cast", [f"where{k}"], [f"float{k}"], to=TYPES["float32"]),
-            node("Reshape", [f"float{k}", "column"], [f"x{k}"]),
-            node("Mul", [f"x{k}", "zero"], [f"none{k}"]),
-            node("Add", [f"none{k}", "one"], [f"ones{k}"]),
-            node("CumSum", [f"ones{k}", "axis"], [f"counted{k}"]),
-            node("Sub", [f"counted{k}", "one"], [f"y{k}"]),
-            node("Concat", [f"x{k}", f"y{k}"], [f"mkpts{k}"], axis=1),
-        ]
-    nodes += [
-        node("ReduceMax", ["image0"], ["bright"], axes=[3], keepdims=0),
-        node("Reshape", ["bright", "flat"], ["mconf"]),
-    ]
-    initializers = {"column": np.array([-1, 1]), "flat": np.array([-1]), "axis": np.array(0)}
-    initializers |= {"zero": np.array(0.0, np.float32), "one": np.array(1.0, np.float32)}
-    images = [value(f"image{k}", [1, 1, "height", "width"]) for k in "01"]
-    return model(nodes, [tensor(n, a) for n, a in initializers.items()], images, outputs)
 
 
 def mean_colours(cell_px: int) -> bytes:

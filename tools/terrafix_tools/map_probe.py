@@ -9,7 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View, without_colour
+from terrafix.anchor.matching.frame_matcher import (
+    AS_PREDICTED,
+    FrameMatcher,
+    Hypothesis,
+    View,
+    view_at,
+    without_colour,
+)
 from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.geodesy import LocalFrame, rot_w_b
 from terrafix.map.package import MapPackage
@@ -82,7 +89,9 @@ def reported_view(shot: Shot, origin: Origin) -> tuple[np.ndarray, View] | None:
 
 def _score(matcher: FrameMatcher, grey: np.ndarray, view: View, window: _Window, hypothesis: Hypothesis) -> float:
     """Highest standardised correlation of a frame in the window; 0 where it cannot be correlated."""
-    found = matcher.correlate_as(without_colour(grey, matcher.gradients), view, window, hypothesis)
+    turned = view_at(view, hypothesis, view.e_m, view.n_m)
+    grey, gsd_m = without_colour(grey, matcher.gradients), matcher.correlation_cell_m(turned.agl_m)
+    found = matcher.correlate_on(grey, turned, window, (AS_PREDICTED,), gsd_m)
     return max((float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in found.surfaces), default=0.0)
 
 

@@ -7,7 +7,6 @@ from terrafix_engines.features.exported import ExportedDetector
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_engines.features.keypoints import Detector, MutualNearestMatcher
 from terrafix_engines.features.lightglue import LightGlueMatcher
-from terrafix_engines.features.semidense import SemiDenseMatcher
 from terrafix_engines.features.xfeat import XFeatDescriber, XFeatDetector
 from terrafix_engines.manifest import DENSE_OUTPUTS, ManifestError, find_manifest
 from terrafix_engines.runtime import Model, ModelFileError
@@ -54,11 +53,6 @@ def open_point_features(name: str, folder: str = "") -> tuple[Detector, MutualNe
 def open_matcher(model: StoredModel) -> LightGlueMatcher:
     """Keypoint matcher for a model with role "matcher". Raises ModelFileError."""
     return LightGlueMatcher(model.open(*LightGlueMatcher.names(model.manifest)), model.manifest)
-
-
-def open_pair_matcher(model: StoredModel) -> SemiDenseMatcher:
-    """Image pair matcher for a model with role "pair". Raises ModelFileError."""
-    return SemiDenseMatcher(model.open(*SemiDenseMatcher.names(model.manifest)), model.manifest)
 
 
 def _open_user_xfeat(path: Path, folder: Path) -> XFeatDescriber:

@@ -9,7 +9,7 @@ import pytest
 
 import tiny_onnx
 from terrafix_engines import manifest
-from terrafix_engines.features import open_describer, open_detector, open_matcher, open_pair_matcher
+from terrafix_engines.features import open_describer, open_detector, open_matcher
 from terrafix_engines.features.exported import to_pixels
 from terrafix_engines.features.image_input import image_tensor
 from terrafix_engines.features.keypoints import (
@@ -214,21 +214,7 @@ def test_swapped_outputs_in_a_keypoint_manifest_are_reported(tmp_path: Path) -> 
         detector.detect(np.zeros((64, 64, 3), np.uint8), 10)
 
 
-def test_an_image_pair_model_returns_corresponding_points(tmp_path: Path) -> None:
-    """The graph outputs the brightest pixel of each row of both images, so the expected result is known."""
-    first, second = np.zeros((8, 20, 3), np.uint8), np.zeros((6, 24, 3), np.uint8)
-    for row, (x0, x1) in enumerate(((3, 5), (19, 23), (0, 11), (7, 9), (2, 1), (4, 6))):
-        first[row, x0], second[row, x1] = 51 * row, 255
-    matcher = open_pair_matcher(stored(tmp_path, tiny_onnx.PAIR, tiny_onnx.brightest_of_rows()))
-    found = matcher.match(first, second)
-    # Both are padded to 24 x 8. Rows 6 and 7 of the second one are padding, and bright: they must be dropped.
-    assert matcher.name == "both"
-    assert found.first_px.tolist() == [[0, 0], [19, 1], [0, 2], [7, 3], [2, 4], [4, 5]]
-    assert found.second_px.tolist() == [[5, 0], [23, 1], [11, 2], [9, 3], [1, 4], [6, 5]]
-    assert np.allclose(found.confidence, [0, 0.2, 0.4, 0.6, 0.8, 1.0])
-
-
-def test_swapped_outputs_in_a_pair_manifest_are_reported(tmp_path: Path) -> None:
+def test_contradictions_in_a_pair_manifest_are_reported(tmp_path: Path) -> None:
     other = tiny_onnx.PAIR.replace('name = "image1"\nshape = [1, 1,', 'name = "image1"\nshape = [1, 3,')
     for text, reason in (
         (other, "'image1' must have the shape of 'image0'"),
@@ -240,13 +226,6 @@ def test_swapped_outputs_in_a_pair_manifest_are_reported(tmp_path: Path) -> None
     ):
         with pytest.raises(manifest.ManifestError, match=reason):
             stored(tmp_path, text, b"no model")
-    outputs = {"mkpts0": np.zeros((3, 2)), "mkpts1": np.zeros((3, 2)), "mconf": np.zeros(2)}
-    pictures: dict[str, tuple[tiny_onnx.Shape, str]] = {f"image{k}": ([1, 1, "h", "w"], "float32") for k in (0, 1)}
-    content = tiny_onnx.constants(pictures, {k: v.astype(np.float32) for k, v in outputs.items()})
-    stated = tiny_onnx.PAIR.replace('name = "mconf"\nshape = ["pairs"]', 'name = "mconf"\nshape = ["scores"]')
-    matcher = open_pair_matcher(stored(tmp_path, stated, content))
-    with pytest.raises(ModelRunError, match=r"both: 3 and 3 points, 2 scores; check \[pair\]"):
-        matcher.match(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8, 3), np.uint8))
 
 
 @pytest.fixture

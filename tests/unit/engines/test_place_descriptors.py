@@ -118,7 +118,7 @@ def test_names_differ_when_weights_differ(tmp_path: Path) -> None:
 
 
 def test_models_that_cannot_describe_places_are_refused_in_one_line(tmp_path: Path) -> None:
-    tiny_onnx.write(tmp_path, tiny_onnx.PAIR, tiny_onnx.brightest_of_rows())
+    tiny_onnx.write(tmp_path, tiny_onnx.PAIR, b"no model")
     with pytest.raises(ModelFileError, match="its role is pair, not dense or global"):
         open_place_describer("both", str(tmp_path))
     with pytest.raises(ModelFileError, match=r"'nothing'.*or pooled-gradient"):

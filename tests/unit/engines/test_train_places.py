@@ -14,6 +14,7 @@ import map_rasters
 from terrafix_lab.train import ground as ground_module
 from terrafix_lab.train.errors import TrainingError
 from terrafix_lab.train.ground import MIN_SIDE_PX, Place, inputs_of, read_list, read_places
+from terrafix_tools.models.matching import read_sets
 
 GSD_M = 0.5
 
@@ -117,6 +118,12 @@ def test_an_invalid_place_list_is_rejected(tmp_path: Path, text: str, reason: st
     path.write_text(text)
     with pytest.raises(TrainingError, match=reason):
         read_list(path)
+
+
+def test_what_judges_weights_neither_trains_them_nor_stops_the_training() -> None:
+    lists = Path(__file__).parents[3] / "config/training"
+    judges = {path for one in read_sets(lists / "judges.toml") for path in (one.camera, one.map) if path}
+    assert judges and judges.isdisjoint(path for place in read_list(lists / "places.toml") for path in place.pictures)
 
 
 def test_without_pytorch_the_error_names_the_package_to_install() -> None:

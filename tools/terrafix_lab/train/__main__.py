@@ -62,15 +62,14 @@ def train(args: argparse.Namespace) -> None:
 
 def line(progress: Progress, steps: int) -> str:
     pace = f"  {progress.steps_per_s:.2f} steps/s" if progress.steps_per_s else ""
-    found = f"  {progress.evaluation}" if progress.evaluation else ""
-    return f"{progress.step}/{steps}  {progress.nats:.3f} nats{pace}{found}"
+    held_out = "" if progress.held_out_nats is None else f"  held out: {progress.held_out_nats:.3f} nats"
+    return f"{progress.step}/{steps}  {progress.nats:.3f} nats{pace}{held_out}"
 
 
 def row(progress: Progress) -> str:
-    """A row of log.csv: step, loss; of the held-out places loss, share that leads, margin."""
-    found = progress.evaluation
-    held_out = [f"{found.nats:.4f}", f"{found.leads:.4f}", f"{found.margin:.4f}"] if found else ["", "", ""]
-    return ",".join([str(progress.step), f"{progress.nats:.4f}", *held_out]) + "\n"
+    """A row of log.csv: step, loss, loss on the held-out places."""
+    held_out = "" if progress.held_out_nats is None else f"{progress.held_out_nats:.4f}"
+    return f"{progress.step},{progress.nats:.4f},{held_out}\n"
 
 
 def arguments() -> argparse.Namespace:

@@ -2,6 +2,7 @@
 
 import copy
 import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,19 +61,19 @@ def export(network: FeatureNetwork, folder: Path, text_fields: ManifestText) -> 
 
 
 def manifest(text_fields: ManifestText, file: str, content: bytes) -> str:
-    """The manifest as TOML; the inputs of the training are comments, which nobody else needs to read."""
+    """The manifest as TOML (strings as in JSON); the inputs of the training are comments, which nobody else reads."""
     presets = "".join(f"\n[[presets]]\nsizes = {{ batch = 1, height = {side}, width = {side} }}\n" for side in SIDES)
     made_from = "".join(
         f"# {one['use']}: {one['name']}, sha256 {one['sha256']}, {one['licence']}\n" for one in text_fields.inputs
     )
-    return f"""{made_from}name = {_quoted(text_fields.name)}
+    return f"""{made_from}name = {json.dumps(text_fields.name)}
 title = "trained by terrafix_lab.train: dense descriptors of cells of {STRIDE} px"
 role = "dense"
-file = {_quoted(file)}
+file = {json.dumps(file)}
 sha256 = "{hashlib.sha256(content).hexdigest()}"
 size_bytes = {len(content)}
-licence = {_quoted(text_fields.licence)}
-credit = {_quoted(text_fields.credit)}
+licence = {json.dumps(text_fields.licence)}
+credit = {json.dumps(text_fields.credit)}
 
 [image]
 input = "{INPUT}"
@@ -87,9 +88,3 @@ shape = ["batch", 3, "height", "width"]
 name = "{OUTPUTS[0]}"
 shape = ["batch", {CHANNELS}, "height/{STRIDE}", "width/{STRIDE}"]
 {presets}"""
-
-
-def _quoted(text: str) -> str:
-    """A one-line TOML string."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
-    return f'"{escaped}"'

@@ -69,10 +69,8 @@ def read_list(path: Path) -> list[Place]:
             raise TrainingError(f"{path}: {place.name} states no licence; weights could not be passed on: state it")
     if not any(place.held_out for place in places) or all(place.held_out for place in places):
         raise TrainingError(f"{path}: needs places to train on and others with held_out = true to measure on")
-    shared = {p for one in places if one.held_out for p in one.pictures} & {
-        p for one in places if not one.held_out for p in one.pictures
-    }
-    if shared:
+    kept, trained = ({p for one in places if one.held_out is apart for p in one.pictures} for apart in (True, False))
+    if shared := kept & trained:
         raise TrainingError(f"{path}: {min(shared)} is trained on and held out; choose one")
     return places
 

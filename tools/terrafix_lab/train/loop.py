@@ -16,15 +16,14 @@ import torch
 
 from terrafix_lab.train.errors import TrainingError
 from terrafix_lab.train.losses import TrainingLoss
-from terrafix_lab.train.measure import Evaluation, evaluate
 from terrafix_lab.train.network import FeatureNetwork
-from terrafix_lab.train.views import ImageStack, Views, sample_views
+from terrafix_lab.train.views import EVALUATION_RANGES, ImageStack, Views, sample_views
 from terrafix_lab.train.weather import augment
 
 LEARNING_RATE, WARM_UP_SHARE, WEIGHT_DECAY, MAX_GRADIENT_NORM = 2e-3, 0.05, 1e-2, 1.0
 CHECKPOINT_EVERY_S = 60.0
 REPORT_EVERY, EVALUATION_EVERY = 25, 250  # steps
-EVALUATION_VIEWS = 96
+EVALUATION_VIEWS, EVALUATION_SEED = 96, 5  # the same views in every evaluation
 PATIENCE = 8  # evaluations without a better one after which the training stops
 LOSS_SMOOTHING = 0.98  # exponential smoothing of the reported loss
 
@@ -46,7 +45,7 @@ class Progress:
     step: int
     nats: float
     steps_per_s: float
-    evaluation: Evaluation | None
+    held_out_nats: float | None  # loss on the held-out places
 
 
 class Training:
@@ -91,18 +90,28 @@ class Training:
             if time.monotonic() - checkpoint_s >= CHECKPOINT_EVERY_S:
                 self.save_checkpoint()
                 checkpoint_s = time.monotonic()
-        evaluation = self._judge()
+        nats = self._judge()
         self.save_checkpoint()
-        yield Progress(self.step, smoothed or 0.0, 0.0, evaluation)
+        yield Progress(self.step, smoothed or 0.0, 0.0, nats)
 
-    def _judge(self) -> Evaluation:
-        """Evaluates, and keeps the weights if they are the best."""
-        batches = max(EVALUATION_VIEWS // self.recipe.batch, 1)
-        found = evaluate(self.network, self._criterion, self._held_out, batches, self.recipe.batch)
-        if found.nats < self._best_nats:
-            self._best_nats, self._best_step = found.nats, self.step
+    def _judge(self) -> float:
+        """-> the loss on the held-out places; keeps the weights if it is the least."""
+        nats = self._held_out_nats()
+        if nats < self._best_nats:
+            self._best_nats, self._best_step = nats, self.step
             self._best = copy.deepcopy(self.network.state_dict())
-        return found
+        return nats
+
+    @torch.no_grad()
+    def _held_out_nats(self) -> float:
+        self.network.eval()
+        rng, batch = np.random.default_rng(EVALUATION_SEED), self.recipe.batch
+        batches = [
+            self._criterion(self.network, sample_views(self._held_out, batch, rng, EVALUATION_RANGES))[0]
+            for _ in range(max(EVALUATION_VIEWS // batch, 1))
+        ]
+        self.network.train()
+        return float(torch.stack(batches).mean())
 
     def save_checkpoint(self) -> None:
         """Writes the checkpoint atomically, because a truncated one could not be resumed."""

@@ -34,12 +34,6 @@ class PlaceScores:
         own = torch.eye(len(self.z), dtype=torch.bool, device=self.z.device)[:, :, None, None]
         return ~own | (self.distance[:, None] > EXCLUDED_CELLS)
 
-    def margins(self) -> Tensor:
-        """(B,): the right place's lead over the best wrong place, standard deviations."""
-        own = self.z.diagonal(dim1=0, dim2=1).permute(2, 0, 1)
-        right = own.masked_fill(self.distance > NEAR_CELLS, -1e4).flatten(1).amax(1)
-        return right - self.z.masked_fill(~self.wrong, -1e4).flatten(1).amax(1)
-
 
 class TrainingLoss(nn.Module):
     """Negative log likelihood of the true place, nats, with the learnt slope."""

@@ -31,32 +31,28 @@ def check(
     camera: CameraOption = None,
     agl: AglOption = None,
     layer: LayerOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG, or HTML page, to write: where on the map frames are placed alone.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
-    """Suitability of a map: coverage, resolution, age, matchable ground. Fails when the mission leaves the map."""
+    """Suitability of a map: coverage, resolution, age, share of frames that are placed alone. Fails when the mission
+    leaves the map."""
     from terrafix_tools.mapping.check.preview import print_check
 
-    print_check(package, mission, camera, agl, layer, as_json=as_json)
+    print_check(package, mission, camera, agl, layer, picture, as_json=as_json)
 
 
 def preview(
     package: PackageArgument,
-    out: Annotated[Path, typer.Option(help="PNG (the map), or HTML (with the matchable ground).")] = Path(
-        "preview.png"
-    ),
-    size: Annotated[int, typer.Option(min=64, max=8192, help="Longer side of the PNG, pixels.")] = 1024,
-    mission: MissionOption = None,
-    camera: CameraOption = None,
-    agl: AglOption = None,
+    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("preview.png"),
+    size: Annotated[int, typer.Option(min=64, max=8192, help="Longer side, pixels.")] = 1024,
     layer: LayerOption = None,
 ) -> None:
-    """The whole map, north up, as an image or a page; transparent where the map has no imagery."""
-    from terrafix_tools.mapping.check.preview import preview, preview_page
+    """The whole map, north up; transparent where it has no imagery."""
+    from terrafix_tools.mapping.check.preview import preview
 
-    if out.suffix.lower() in (".html", ".htm"):
-        preview_page(package, out, mission, camera, agl, layer)
-    else:
-        preview(package, out, size, layer)
+    preview(package, out, size, layer)
 
 
 def keygen(

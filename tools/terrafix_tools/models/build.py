@@ -1,9 +1,12 @@
-"""`terrafix models build`: builds TensorRT engines before the flight, on the computer that will fly."""
+"""`terrafix models export`: graphs of this program itself, which need no weights; `terrafix models build`: TensorRT
+engines, before the flight, on the computer that will fly."""
 
 import typer
 
-from terrafix.core.errors import ModelError
+from terrafix.core.errors import ModelError, OutputError
 from terrafix_engines import gpu, providers
+from terrafix_engines.correlation import export
+from terrafix_engines.store import models_folder
 from terrafix_tools.models.known import as_model_errors, fetched_models
 from terrafix_tools.models.listing import open_complete
 
@@ -29,3 +32,14 @@ def build_all(names: list[str], folder: str) -> None:
                 f"{m.name}: no engine ({opened.rejected_providers[0]}); it would be run by {opened.provider}"
             )
         typer.echo(f"{m.name}: ready in {model.engines / opened.sha256[:16]}")
+
+
+def export_correlation(folder: str, *, fp16: bool) -> None:
+    """Raises OutputError when the models folder cannot be written."""
+    where = models_folder(folder)
+    try:
+        paths = export(where, fp16)
+    except OSError as error:
+        raise OutputError(f"{where}: cannot be written ({error.strerror}); choose another --folder") from None
+    for path in paths:
+        typer.echo(f"written to {path}")

@@ -52,7 +52,7 @@ def export(
     folder: Folder = "",
 ) -> None:
     """Write the graphs that correlate frames with the map on a GPU ([models] correlation = "gpu")."""
-    from terrafix_tools.models.export import export_correlation
+    from terrafix_tools.models.build import export_correlation
 
     export_correlation(folder, fp16=fp16)
 

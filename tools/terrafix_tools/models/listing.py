@@ -73,16 +73,5 @@ def open_complete(model: StoredModel, *, prefer: tuple[str, ...] = providers.PRE
 
 
 def _row(model: StoredModel, state: State) -> dict[str, Any]:
-    m = model.manifest
-    return {
-        "name": m.name,
-        "title": m.title,
-        "role": m.role,
-        "state": state.value,
-        "path": str(model.path),
-        "size_bytes": m.size_bytes,
-        "sha256": m.sha256,
-        "licence": m.licence,
-        "credit": m.credit,
-        "source": m.source,
-    }
+    told = ("name", "title", "role", "size_bytes", "sha256", "licence", "credit", "source")
+    return {key: getattr(model.manifest, key) for key in told} | {"state": state.value, "path": str(model.path)}

@@ -20,16 +20,23 @@ from rich.console import Console
 from rich.table import Table
 
 from terrafix.anchor.matching.descriptor_cache import Describer
-from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher, View
+from terrafix.anchor.matching.frame_matcher import (
+    FIX_GSD_PER_AGL,
+    CorrelationResult,
+    FrameMatcher,
+    View,
+    bounded_cells,
+    hypotheses_of,
+)
 from terrafix.anchor.matching.point_mass_filter import MAX_HALF_CELLS, Belief, Mode, belief_cell_m
 from terrafix.anchor.relocalization.position_prior import distance_outside_m
 from terrafix.anchor.verification.single_frame import MAX_MODES, localize_single_frame
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.errors import MapError, OutputError
+from terrafix.core.errors import MapError, OutputError, UsageError
 from terrafix.core.geodesy import LocalFrame, local_rotation_up
 from terrafix.core.node import Image
 from terrafix.core.toml_file import read_toml
-from terrafix.map.null_model import null_row_for
+from terrafix.map.null_model import DEFAULT_NULL, NullRow
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix.messages import Verdict
 from terrafix.vision.sources import open_source
@@ -38,6 +45,8 @@ from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.evaluate import read_truth
 from terrafix_tools.flight_map import package_of
 from terrafix_tools.map_probe import reported_view
+from terrafix_tools.mapping.check.sight import YAW_SIGMA_RAD
+from terrafix_tools.mapping.package.null_model import FLIGHTS, STRETCHES, fit_null_row
 from terrafix_tools.models.known import as_model_errors
 from terrafix_tools.models.two_dates import CAMERA, TwoDates
 
@@ -45,7 +54,6 @@ GRADIENTS = "gradients"
 FALSE_ALARMS = 1e-3
 NEAR_M = 10.0
 APART = 0.25  # heights: two places within it are one, whose patches are the same
-KNOWN_YAW_SIGMA_RAD = math.radians(4.0)  # of a compass, for frames of two dates
 PRIOR_SIGMAS = 2.0  # largest distance of the truth from the centre of the prior, 1-sigmas
 WHOLE_MAP = math.inf
 SEED = 11
@@ -63,10 +71,6 @@ class MatchSet(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     every: int = 1
 
 
-class MatchSets(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    set: list[MatchSet]
-
-
 @dataclass(frozen=True)
 class Frame:
     """``predicted``: at the true place, with the heading and height that are reported."""
@@ -78,11 +82,19 @@ class Frame:
 
 @dataclass(frozen=True)
 class Ground:
-    """A map with frames over it."""
+    """A map with frames over it, at least one."""
 
     source: LocalMap
     camera: CameraCalibration
     frames: list[Frame]
+
+    @functools.cached_property
+    def null(self) -> NullRow:
+        """Of this map at the height of the frames; the general one where the map is too small to learn it."""
+        try:
+            return fit_null_row(self.source, self.frames[0].predicted.agl_m, FLIGHTS, STRETCHES)
+        except UsageError:
+            return DEFAULT_NULL
 
 
 @dataclass(frozen=True)
@@ -135,8 +147,8 @@ def measure_matching(
 def read_sets(path: Path) -> list[MatchSet]:
     """The sets of a TOML list. Raises MapError."""
     try:
-        return msgspec.convert(read_toml(path), MatchSets).set
-    except (OSError, ValueError, msgspec.ValidationError) as error:
+        return msgspec.convert(read_toml(path), dict[str, list[MatchSet]])["set"]
+    except (OSError, KeyError, ValueError, msgspec.ValidationError) as error:
         raise MapError(f"{path}: no list of sets ({error}); docs/models.md shows one") from None
 
 
@@ -148,14 +160,14 @@ def ground_of(one: MatchSet, folder: Path, places: int) -> Ground:
         rng = np.random.default_rng(SEED)
         frames = []
         for true in dates.draw(places, one.agl_m, SEED):
-            yaw_rad = -true.heading_rad + rng.normal(0.0, KNOWN_YAW_SIGMA_RAD)
+            yaw_rad = -true.heading_rad + rng.normal(0.0, YAW_SIGMA_RAD)
             e_m, n_m = (float(v) for v in true.place_m)
             predicted = replace(
                 true.predicted,
                 e_m=e_m,
                 n_m=n_m,
                 r_w_c=local_rotation_up(yaw_rad) @ true.predicted.r_w_c,
-                yaw_sigma_rad=KNOWN_YAW_SIGMA_RAD,
+                yaw_sigma_rad=YAW_SIGMA_RAD,
             )
             frames.append(Frame(true.frame, predicted, NEAR_M))
         return Ground(source, CAMERA, frames)
@@ -203,21 +215,22 @@ def _methods_on(
         belief_at = _prior(view, prior_m, ground.source, rng, matchers[GRADIENTS])
         for mirrored in (False, True):
             image = np.ascontiguousarray(frame.image[:, ::-1]) if mirrored else frame.image
-            seen = {name: _correlated(name, matcher, image, view, belief_at()) for name, matcher in matchers.items()}
+            seen = {n: _correlated(n, one, matchers[n], image, view, belief_at()) for n, one in describers.items()}
             for name in names:
                 chosen = [seen[one] for one in name]
-                place = functools.partial(_place, image, view, chosen[-1][0], ground.source, matchers[GRADIENTS])
+                place = functools.partial(_place, image, view, chosen[-1][0], ground, matchers[GRADIENTS])
                 (nulls if mirrored else looks)[name].append(_look(chosen, frame, belief_at(), place))
     for name in names:
         yield _summary("+".join(name), looks[name], nulls[name])
 
 
 def _place(
-    image: Image, view: View, found: CorrelationResult, source: LocalMap, matcher: FrameMatcher, modes: list[Mode]
+    image: Image, view: View, found: CorrelationResult, ground: Ground, matcher: FrameMatcher, modes: list[Mode]
 ) -> np.ndarray | None:
     """East and north of the pose in the mode that the patches choose."""
-    null = null_row_for(source.layers[0].null_model, matcher.gradients.name, view.agl_m)
-    placed = localize_single_frame(image, view, found, modes, source, matcher, null, math.log(FALSE_ALARMS))
+    placed = localize_single_frame(
+        image, view, found, modes, ground.source, matcher, ground.null, math.log(FALSE_ALARMS)
+    )
     fit = None if placed is None else placed[1].pnp.fit
     return None if fit is None else fit.p_c_in_w_m[:2]
 
@@ -241,12 +254,16 @@ def _prior(
 
 
 def _correlated(
-    method: str, matcher: FrameMatcher, image: Image, view: View, belief: Belief
+    method: str, describer: Describer, matcher: FrameMatcher, image: Image, view: View, belief: Belief
 ) -> tuple[CorrelationResult, float]:
     """With its processor time, ms; the map's descriptors are there already, as for all frames but a flight's first."""
-    correlate = matcher.correlate if method == GRADIENTS else matcher.correlate_learned
     began_s = time.process_time()
-    found = correlate(image, view, belief)
+    if method == GRADIENTS:
+        found = matcher.correlate(image, view, belief)
+    else:
+        gsd_m = matcher.cell_m(view.agl_m, FIX_GSD_PER_AGL[describer.name])
+        gsd_m, pool = bounded_cells(gsd_m, describer.stride, belief)
+        found = matcher.correlate_on(image, view, belief, hypotheses_of(view), gsd_m, pool, describer)
     return found, (time.process_time() - began_s) * 1e3
 
 

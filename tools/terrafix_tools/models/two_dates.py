@@ -18,12 +18,11 @@ from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.flight_map import map_cache_dir
 from terrafix_tools.mapping.build import ensure_package
+from terrafix_tools.mapping.check.sight import NORTH_UP, TILT_SIGMA_RAD
 from terrafix_tools.mapping.source import ImagerySource
 
 CAMERA = CameraCalibration(640, 480, 554.0, 554.0, 319.5, 239.5)  # 60 degrees wide
-NORTH_UP = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # camera to world, looking straight down
 HEIGHT_ERROR = 0.03  # largest relative error of the height that the view states
-TILT_SIGMA_RAD = math.radians(1.0)
 MARGIN = 0.75  # heights: least distance of a place from the border; the corner of a frame is 0.72 away
 EMPTY_SHARE = 0.02  # largest share of a frame without imagery, in either image
 MAX_DRAWS = 10_000

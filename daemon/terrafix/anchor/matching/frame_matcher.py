@@ -242,32 +242,20 @@ class FrameMatcher:
 
         Verdict TOO_LOW: the frame covers too few cells or sees no ground; OUTSIDE_MAP: no map data in the window.
         """
-        hypotheses = self._next_subset(_hypotheses(view))
+        hypotheses = self._next_subset(hypotheses_of(view))
         image = without_colour(image, self.gradients)
-        gsd, pool = _bounded(self.correlation_cell_m(view.agl_m), 1, belief)
+        gsd, pool = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
         # Of a drawn map, which says little, every hypothesis counts: the belief itself searches it. Its lines are as
         # clear on larger pixels.
         if self._drawn:
-            return self._correlated(image, view, belief, hypotheses, gsd * pool)
+            return self.correlate_on(image, view, belief, hypotheses, gsd * pool)
         if len(hypotheses) > MAX_FINE_HYPOTHESES:
-            coarse = self._correlated(image, view, belief, hypotheses, gsd, 2 * pool)
+            coarse = self.correlate_on(image, view, belief, hypotheses, gsd, 2 * pool)
             if coarse.verdict is Verdict.ACCEPTED:
                 hypotheses = coarse.best_hypotheses(MAX_FINE_HYPOTHESES)
-        return self._correlated(image, view, belief, hypotheses, gsd, pool)
+        return self.correlate_on(image, view, belief, hypotheses, gsd, pool)
 
-    def correlate_as(self, grey: Image, view: View, belief: SearchWindow, hypothesis: Hypothesis) -> CorrelationResult:
-        """``correlate`` of a grey image with one hypothesis of yaw and height, of any size."""
-        turned = view_at(view, hypothesis, view.e_m, view.n_m)
-        return self._correlated(grey, turned, belief, (AS_PREDICTED,), self.correlation_cell_m(turned.agl_m))
-
-    def correlate_learned(self, image: Image, view: View, belief: SearchWindow) -> CorrelationResult:
-        """``correlate`` on the descriptors of the learned model."""
-        gsd, pool = _bounded(
-            self.cell_m(view.agl_m, FIX_GSD_PER_AGL[self._describer.name]), self._describer.stride, belief
-        )
-        return self._correlated(image, view, belief, _hypotheses(view), gsd, pool, self._describer)
-
-    def _correlated(
+    def correlate_on(
         self,
         image: Image,
         view: View,
@@ -277,8 +265,9 @@ class FrameMatcher:
         pool: int = 1,
         learned: Describer | None = None,
     ) -> CorrelationResult:
-        """``image``: grey where that is enough; ``gsd``: metres, of the pixels that are described; ``pool``: cells of
-        the describer in a side of those that are correlated; ``learned``: describer instead of the gradients."""
+        """``correlate`` with given hypotheses. ``image``: grey where that is enough; ``gsd``: metres, of the pixels
+        that are described; ``pool``: cells of the describer in a side of those that are correlated; ``learned``: the
+        describer of this matcher, instead of the gradients."""
         features = self._pooled(learned or self.gradients, pool)
         describer = features.describer
         cell = gsd * describer.stride
@@ -411,7 +400,7 @@ class FrameMatcher:
         return (frame.e_min_m, frame.n_max_m, frame.e_min_m + w * frame.gsd_m, frame.n_max_m - h * frame.gsd_m)
 
 
-def _bounded(gsd: float, stride: int, belief: SearchWindow) -> tuple[float, int]:
+def bounded_cells(gsd: float, stride: int, belief: SearchWindow) -> tuple[float, int]:
     """Pixel size and pool of a window that has at most ``MAX_WINDOW_CELLS`` cells a side."""
     pool = 1
     while 2 * belief.half_m / (gsd * stride * pool) > MAX_WINDOW_CELLS:
@@ -464,7 +453,7 @@ def _describe(frame: Rectified, describer: Describer) -> tuple[np.ndarray, np.nd
     return describer.describe(frame.image), mask
 
 
-def _hypotheses(view: View) -> tuple[Hypothesis, ...]:
+def hypotheses_of(view: View) -> tuple[Hypothesis, ...]:
     """Grid over 1.5 sigmas of yaw and scale where these exceed the tolerance. If yaw and scale together exceed
     ``MAX_HYPOTHESES``, the full product on coarser steps: no yaw fits at a scale that was not tried."""
     half_yaw, half_scale = min(1.5 * view.yaw_sigma_rad, np.pi), min(1.5 * view.scale_sigma, 0.5)

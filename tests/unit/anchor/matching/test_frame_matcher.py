@@ -16,7 +16,7 @@ from terrafix.anchor.matching.frame_matcher import (
     Hypothesis,
     PatchFix,
     View,
-    _hypotheses,
+    hypotheses_of,
 )
 from terrafix.anchor.matching.match_message import pose_match
 from terrafix.anchor.matching.point_mass_filter import Belief, Surface
@@ -79,12 +79,12 @@ def test_a_frame_is_blurred_once_for_all_yaw_hypotheses(
 
 
 def test_known_yaw_and_scale_give_one_hypothesis() -> None:
-    assert _hypotheses(predicted_view(yaw_sigma_deg=1.0, scale_sigma=0.02)) == (Hypothesis(0.0, 1.0),)
+    assert hypotheses_of(predicted_view(yaw_sigma_deg=1.0, scale_sigma=0.02)) == (Hypothesis(0.0, 1.0),)
 
 
 @pytest.mark.parametrize(("yaw_sigma_deg", "scale_sigma"), [(3.0, 0.03), (8.0, 0.02), (2.0, 0.1), (10.0, 0.08)])
 def test_the_grid_covers_one_and_a_half_sigmas(yaw_sigma_deg: float, scale_sigma: float) -> None:
-    grid = _hypotheses(predicted_view(yaw_sigma_deg=yaw_sigma_deg, scale_sigma=scale_sigma))
+    grid = hypotheses_of(predicted_view(yaw_sigma_deg=yaw_sigma_deg, scale_sigma=scale_sigma))
     yaws, scales = sorted({h.yaw_rad for h in grid}), sorted({h.scale for h in grid})
     assert len(grid) == len(yaws) * len(scales)  # the product of yaws and scales
     assert Hypothesis(0.0, 1.0) in grid
@@ -96,14 +96,14 @@ def test_the_grid_covers_one_and_a_half_sigmas(yaw_sigma_deg: float, scale_sigma
 
 
 def test_without_a_compass_all_yaws_are_hypotheses() -> None:
-    grid = _hypotheses(predicted_view(yaw_sigma_deg=170.0, scale_sigma=0.02))
+    grid = hypotheses_of(predicted_view(yaw_sigma_deg=170.0, scale_sigma=0.02))
     assert len(grid) <= MAX_HYPOTHESES
     yaws = np.sort(np.degrees([h.yaw_rad for h in grid if h.scale == 1.0]))
     assert yaws[0] <= -172.0 and yaws[-1] >= 172.0 and np.diff(yaws).max() <= 8.0
 
 
 def test_without_compass_and_height_every_yaw_is_combined_with_every_scale() -> None:
-    grid = _hypotheses(predicted_view(yaw_sigma_deg=170.0, scale_sigma=0.4))
+    grid = hypotheses_of(predicted_view(yaw_sigma_deg=170.0, scale_sigma=0.4))
     yaws, scales = sorted({h.yaw_rad for h in grid}), sorted({h.scale for h in grid})
     assert MAX_HYPOTHESES < len(grid) == len(yaws) * len(scales) < 350
     assert yaws[0] <= np.radians(-172.0) and yaws[-1] >= np.radians(172.0) and np.diff(yaws).max() <= np.radians(13.0)
@@ -112,12 +112,12 @@ def test_without_compass_and_height_every_yaw_is_combined_with_every_scale() -> 
 
 
 def test_hypotheses_above_the_limit_are_spread_over_consecutive_frames(matcher: FrameMatcher) -> None:
-    grid = _hypotheses(predicted_view(yaw_sigma_deg=170.0, scale_sigma=0.4))
+    grid = hypotheses_of(predicted_view(yaw_sigma_deg=170.0, scale_sigma=0.4))
     turns = [matcher._next_subset(grid) for _ in range(4)]
     assert max(len(turn) for turn in turns) < 1.1 * MAX_HYPOTHESES
     assert sorted((h.yaw_rad, h.scale) for turn in turns for h in turn) == sorted((h.yaw_rad, h.scale) for h in grid)
     assert 1.0 in {h.scale for h in turns[0]} and matcher._next_subset(grid) == turns[0]
-    few = _hypotheses(predicted_view(yaw_sigma_deg=8.0, scale_sigma=0.1))
+    few = hypotheses_of(predicted_view(yaw_sigma_deg=8.0, scale_sigma=0.1))
     assert matcher._next_subset(few) == few == matcher._next_subset(few)
 
 

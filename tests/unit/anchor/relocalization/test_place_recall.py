@@ -1,8 +1,6 @@
-"""Place recognition on imagery of two dates (SV-9: the right place is among the best five in more than 85 %; it is the
-best one in more than 95 % of the frames whose heading is right)."""
+"""Single frames on imagery of two dates (SV-9): places among the best five, and matches of frames of right heading."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +11,12 @@ import map_rasters
 from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.verification.hypothesis_tracker import MERGE_RADIUS
 from terrafix.core.errors import MapError
-from terrafix.core.geodesy import local_rotation_up
 from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget
+from terrafix_tools.mapping.check.sight import MatchabilityProbe
 from terrafix_tools.models.two_dates import TrueView, TwoDates
 from textured_ground import texture
 
 REQUIRED, AMONG, PLACES, SEED = 0.85, 5, 80, 1
-REQUIRED_BY_HEADING, HEADING_SIGMA_RAD = 0.95, np.radians(4.0)  # of a compass
 NIGHTLY = ("joplin", "adiyaman-6", "gaziantep-2")  # towns
 SETS = {
     "joplin": ("imagery/joplin/after.tif", "imagery/joplin/before.tif", 130.0),
@@ -27,23 +24,21 @@ SETS = {
     "gaziantep-2": ("imagery/gaziantep-2/winter.tif", "imagery/gaziantep-2/dry.tif", 90.0),
     "prairie": ("imagery/prairie/20180716.tif", "imagery/prairie/20120731.tif", 800.0),
 }
+MATCHED = 0.95  # required share of frames of right heading that are matched
+UNMATCHED = {"joplin": 0.87, "adiyaman-6": 0.76, "gaziantep-2": 0.79}  # as SHORT, of MATCHED
 # Sets that do not reach REQUIRED yet, with the share that they reached when this was written, less three places.
 SHORT = {"joplin": 0.68, "adiyaman-6": 0.70, "gaziantep-2": 0.78}
 
 
-def recall(dates: TwoDates, agl_m: float, places: int, *, heading_known: bool = False) -> float:
+def recall(dates: TwoDates, agl_m: float, places: int) -> float:
     """Share of ``places`` frames of unknown heading whose true place is among the best AMONG that the joint
-    correlation of the search proposes; with the heading: whose place is the best one."""
+    correlation of the search proposes."""
     source, matcher = dates.open()
 
     def is_found(view: TrueView) -> bool:
         search = MapSearch(source, matcher, agl_m, None, DEFAULT_NULL, FalseAlarmBudget())
-        seen = view.predicted
-        if heading_known:
-            turned = local_rotation_up(-view.heading_rad) @ seen.r_w_c
-            seen = replace(seen, r_w_c=turned, yaw_sigma_rad=HEADING_SIGMA_RAD)
-        search.correlate_region(view.frame, seen)
-        best_m = np.array([(p.e_m, p.n_m) for p in search.proposed[: 1 if heading_known else AMONG]]).reshape(-1, 2)
+        search.correlate_region(view.frame, view.predicted)
+        best_m = np.array([(place.e_m, place.n_m) for place in search.proposed[:AMONG]])
         return bool((np.hypot(*(best_m - view.place_m).T) <= MERGE_RADIUS * agl_m).any())
 
     return float(np.mean([is_found(view) for view in dates.draw(places, agl_m, SEED)]))
@@ -58,13 +53,30 @@ def test_the_right_place_is_among_the_best_five_as_often_as_required(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first, second, agl_m = SETS[name]
-    dates = TwoDates(data_set(first), data_set(second))
-    found = recall(dates, agl_m, PLACES)
+    found = recall(TwoDates(data_set(first), data_set(second)), agl_m, PLACES)
     if name in SHORT:
         assert found >= SHORT[name], f"{name} is known to be short of {REQUIRED}, and became worse"
         assert found <= REQUIRED, f"{name} passes now: take it off the list SHORT"
     else:
-        assert found > REQUIRED and recall(dates, agl_m, PLACES // 2, heading_known=True) > REQUIRED_BY_HEADING
+        assert found > REQUIRED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SETS)
+def test_a_frame_of_right_heading_is_matched_as_often_as_required(
+    data_set: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first, second, agl_m = SETS[name]
+    dates = TwoDates(data_set(first), data_set(second))
+    source, matcher = dates.open()
+    probe = MatchabilityProbe(source, source.layers[0], matcher.camera, agl_m, start_sigma_m=10.0)
+    rng, found = np.random.default_rng(SEED), list[bool]()
+    for view in dates.draw(PLACES, agl_m, SEED):
+        place_m = float(view.place_m[0]), float(view.place_m[1])
+        found.append(probe.is_placed(view.frame, probe.prediction(place_m, -view.heading_rad, rng), place_m))
+    share = np.mean(found)
+    assert share > MATCHED if name not in UNMATCHED else UNMATCHED[name] <= share <= MATCHED
 
 
 @pytest.fixture(scope="module")

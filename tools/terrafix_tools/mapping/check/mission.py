@@ -13,7 +13,7 @@ from terrafix_tools.mapping.check.sight import MatchabilityProbe, Sight
 from terrafix_tools.mission.items import POSITIONED, AltitudeFrame, Do, Mission
 
 STEP_M = 20.0  # distance of the sample points of the path
-MAX_SIGHT_POINTS = 600  # points of the path at which matchability is computed: half a minute
+MAX_SIGHT_POINTS = 200  # points of the path at which frames are placed: some twenty seconds
 CIRCLE_POINTS = 24
 
 
@@ -86,10 +86,10 @@ def uncovered(route: MissionRoute, package: MapPackage, layer: str) -> np.ndarra
 
 
 def sight_along(route: MissionRoute, probe: MatchabilityProbe) -> np.ndarray:
-    """(N,) uint8 of Sight, computed at no more than MOST_LOOKS points; other points take the nearest result."""
+    """(N,) uint8 of Sight, computed at no more than MAX_SIGHT_POINTS points; other points take the nearest result."""
     every = max(1, math.ceil(len(route.points_m) / MAX_SIGHT_POINTS))
     sampled = np.arange(0, len(route.points_m), every)
-    seen = np.array([probe.at(*route.points_m[i])[0] for i in sampled], np.uint8)
+    seen = np.array([probe.at(*route.points_m[i]) for i in sampled], np.uint8)
     return seen[np.minimum((np.arange(len(route.points_m)) + every // 2) // every, len(sampled) - 1)]
 
 

@@ -25,16 +25,25 @@ def info(package: Path) -> None:
 
 
 def print_check(
-    package: Path, mission: Path | None, camera: Path | None, agl_m: float | None, layer: str | None, *, as_json: bool
+    package: Path,
+    mission: Path | None,
+    camera: Path | None,
+    agl_m: float | None,
+    layer: str | None,
+    picture: Path | None,
+    *,
+    as_json: bool,
 ) -> None:
-    """Prints the check; raises MapError when the mission leaves the map, and as ``check`` does."""
+    """Prints the check, and writes its picture; raises MapError when the mission leaves the map, and as ``check`` and
+    ``write_page`` do."""
     opened = MapPackage.open(package, verify=True)
     try:
-        report = check(
-            opened, mission=mission, camera=camera, agl_m=agl_m, layer=layer, progress=sys.stderr.isatty()
-        ).report
+        checked = check(opened, mission=mission, camera=camera, agl_m=agl_m, layer=layer, progress=sys.stderr.isatty())
+        if picture is not None:
+            write_page(checked, picture)
     finally:
         opened.close()
+    report = checked.report
     if as_json:
         _print_json(msgspec.to_builtins(report))
     else:
@@ -43,19 +52,6 @@ def print_check(
     if report.mission is not None and report.mission.outside:
         first = report.mission.outside[0]
         raise MapError(f"{mission}: leaves the map for {where(first)}; move the mission, or build a larger map")
-
-
-def preview_page(
-    package: Path, out: Path, mission: Path | None, camera: Path | None, agl_m: float | None, layer: str | None
-) -> None:
-    """Writes the HTML page. Raises as ``check`` does, and OutputError."""
-    opened = MapPackage.open(package)
-    try:
-        write_page(
-            check(opened, mission=mission, camera=camera, agl_m=agl_m, layer=layer, progress=sys.stderr.isatty()), out
-        )
-    finally:
-        opened.close()
 
 
 def preview(package: Path, out: Path, size_px: int, layer: str | None = None) -> None:

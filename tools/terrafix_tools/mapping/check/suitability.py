@@ -38,8 +38,9 @@ from terrafix_tools.progress import progress_bar
 
 DEFAULT_AGL_M = 100.0
 DEFAULT_CAMERA = CameraCalibration(1280, 720, 914.0, 914.0, 640.0, 360.0)  # a common lens, 70 degrees wide
-MAX_GRID_CELLS = 1500  # of the check grid: about half a minute
+MAX_GRID_CELLS = 300  # of the check grid: about half a minute
 OLD_YEARS = 5.0
+SAME_GROUND_YEARS = 0.05  # age of imagery within which crops and leaves look the same
 MATCH_CELLS = 1.0  # expected error of a match in cells: 1.0 m at cells of 1 m over the generated world of the demo
 MEDIAN_SIGMAS = 1.1774  # median of a circular normal error in its sigmas: sqrt(2 ln 2)
 DESCRIBE_S_PER_PX, SEARCH_WARNING_S = 2e-7, 2.0  # 100 km2 at 2 m/px: 5 s of one core
@@ -70,6 +71,7 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     camera: str
     frame_cells: int  # the frame's shorter side
     has_elevation: bool
+    alone: float  # expected share of frames that are placed alone, of imagery of this age
     sees: float
     weak: float
     blind: float
@@ -112,7 +114,7 @@ def check(
     matcher = FrameMatcher(lens, local, GradientDescriber())
     cell_m = matcher.correlation_cell_m(agl_m)
     frame_m = lens.width * agl_m / lens.fx, lens.height * agl_m / lens.fy
-    probe = MatchabilityProbe(local, cell_m, math.sqrt(frame_m[0] * frame_m[1]))
+    probe = MatchabilityProbe(local, found, lens, agl_m)
     e_min, n_min, e_max, n_max = local.bounds_m
     step_m = max(math.sqrt(frame_m[0] * frame_m[1]) / 2, math.sqrt((e_max - e_min) * (n_max - n_min) / MAX_GRID_CELLS))
     with progress_bar(progress) as bar:
@@ -122,12 +124,13 @@ def check(
     mission_check = None
     if route is not None and route_sight is not None:
         mission_check = _mission_check(route, route_sight, str(mission), uncovered(route, package, found.table))
-    accuracy = accuracy_of(found, Map().ce90_m)
+    accuracy, age_years = accuracy_of(found, Map().ce90_m), _age_years(found.date)
+    sees, weak = grid.share(Sight.SEES), grid.share(Sight.WEAK)
     report = MapCheck(
         package=str(package.path),
         layer=found.table,
         date=found.date,
-        age_years=_age_years(found.date),
+        age_years=age_years,
         licence=found.licence,
         signed_by=package.signed_by,
         map_gsd_m=found.gsd_m,
@@ -137,8 +140,9 @@ def check(
         camera=lens_name,
         frame_cells=int(min(frame_m) / cell_m),
         has_elevation=package.manifest.has_dem,
-        sees=grid.share(Sight.SEES),
-        weak=grid.share(Sight.WEAK),
+        alone=sees + weak if age_years is not None and age_years <= SAME_GROUND_YEARS else sees,
+        sees=sees,
+        weak=weak,
         blind=grid.share(Sight.BLIND),
         cell_step_m=step_m,
         expected_error_m=MEDIAN_SIGMAS * math.hypot(accuracy.sigma_m, MATCH_CELLS * cell_m / MEDIAN_SIGMAS),

@@ -1,6 +1,7 @@
 """Text output of `terrafix map check`."""
 
 from terrafix_tools.mapping.check.mission import Stretch
+from terrafix_tools.mapping.check.sight import START_SIGMA_M
 from terrafix_tools.mapping.check.suitability import MapCheck
 
 MAX_LISTED = 3  # stretches listed per kind; the others are counted
@@ -23,9 +24,10 @@ def lines_of(report: MapCheck) -> list[tuple[str, str]]:
             f"{report.frame_cells} of them along the shorter side of a frame",
         ),
         (
-            "sight",
-            f"sees {report.sees:.0%}, weak {report.weak:.0%}, blind {report.blind:.0%} of the map, "
-            f"looked at every {report.cell_step_m:.0f} m",
+            "alone",
+            f"{report.alone:.0%} of frames are expected to be placed alone: {report.sees + report.weak:.0%} while the "
+            f"ground looks as on the map, {report.sees:.0%} in another season or years later, from a start known to "
+            f"{START_SIGMA_M:.0f} m (looked at every {report.cell_step_m:.0f} m)",
         ),
     ]
     if report.mission is not None:

@@ -23,10 +23,10 @@ from terrafix.map.format import Layer
 from terrafix.map.null_model import DEFAULT_NULL, SCORE_VERSION, FalseAlarmBudget, NullModel, NullRow, Tail
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix_engines.features.gradient import GradientDescriber
+from terrafix_tools.mapping.check.sight import NORTH_UP
 from terrafix_tools.mapping.package.rewrite import rewrite_manifest
 
 CAMERA = CameraCalibration(640, 360, 380.0, 380.0, 319.5, 179.5)
-NORTH_UP = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 # 1-sigma errors of a predicted view in a flight with a compass.
 YAW_SIGMA_RAD, SCALE_SIGMA, TILT_SIGMA_RAD = math.radians(11.0), 0.06, math.radians(1.2)
 STEP_SIGMA = 0.01  # 1-sigma of an odometry step, fraction of the height
