@@ -175,6 +175,7 @@ class Propagation:
         """Increment of the motion model, from ``before``, the newest node, to ``frame``; of its motion since an earlier
         ``from_s``, if that is given. ``fused``: odometry enters the graph."""
         state, attitude = self._state, frame.attitude
+        dt_s = state.graph.since_newest_s(frame.t_s) if from_s is None else frame.t_s - from_s
         from_s = state.graph.time_of(state.graph.newest) if from_s is None else from_s
         measured = frame.imu(round(from_s * 1e9), round(frame.t_s * 1e9))
         r_w_c = before.pose.rotation().matrix()
@@ -182,7 +183,7 @@ class Propagation:
             state.camera.yaw_rad(r) for r in (r_w_c, state.camera.expected(attitude, before.calibration, r_w_c))
         )
         return integrate_motion(
-            frame.t_s - from_s,
+            dt_s,
             measured,
             (yaws[0], yaws[1]),
             float(before.calibration[HEADING]),
