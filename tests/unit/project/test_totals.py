@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[3]
 CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
-LINES = {"daemon": 41260, "engines": 1734, "tools": 64329, "tests": 69321}
+LINES = {"daemon": 41260, "engines": 1734, "tools": 64329, "tests": 69330}
 WORDS = 65394  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
