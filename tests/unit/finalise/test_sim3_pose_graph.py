@@ -157,11 +157,13 @@ def test_a_relocalisation_places_a_submap_without_anchors() -> None:
 def test_a_relocalisation_transfers_the_scale() -> None:
     flight = make_submap_flight(10, submaps=2, keyframes=30, scale_known=True, wrong_share=0.0)
     halved = _in_other_units(flight.submaps[1], 2.0)
-    join = replace(relocalisation(flight, (0, 25), (1, 3)), ratio=2.0)
-    merged = merge([flight.submaps[0], halved], without(flight, 1), [join])
-    placed = merged.placements[1]
-    assert placed is not None and abs(float(np.median(placed.m_per_unit)) / 2.0 - 1.0) < 0.05
-    assert np.linalg.norm(placed.p_c_in_w_m - flight.p_w_m[1], axis=1).max() < 30.0
+    onward, back = relocalisation(flight, (0, 25), (1, 3)), relocalisation(flight, (1, 3), (0, 25))
+    in_units = np.repeat([1.0, 0.5], 3)
+    back = replace(back, p_b_in_a=back.p_b_in_a / 2.0, cov=back.cov * np.outer(in_units, in_units), ratio=0.5)
+    for join in (replace(onward, ratio=2.0), back):
+        placed = merge([flight.submaps[0], halved], without(flight, 1), [join]).placements[1]
+        assert placed is not None and abs(float(np.median(placed.m_per_unit)) / 2.0 - 1.0) < 0.05
+        assert np.linalg.norm(placed.p_c_in_w_m - flight.p_w_m[1], axis=1).max() < 30.0
 
 
 def test_an_outlier_relocalisation_is_rejected() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from terrafix.smoother import keyframe_graph
 from terrafix.smoother.keyframe_graph import LONE_FRAMES, Anchor, FrameNode, Join, KeyframeGraph, with_scale
-from terrafix.smoother.solution import _submap, followers, solve
+from terrafix.smoother.solution import _submap, followers, predict, solve
 
 COV = np.diag([0.002, 0.002, 0.002, 0.1, 0.1, 0.1]) ** 2
 ANCHOR_COV = np.diag([0.01, 0.01, 0.01, 1.0, 1.0, 1.0]) ** 2
@@ -205,3 +205,5 @@ def test_a_frame_far_from_its_keyframe_has_the_error_of_the_keyframes_attitude_a
     ((_, far),) = followers(graph, 1, placed)
     alone = with_scale(graph.frames[2])[5, 5] + placed[1].cov[2, 2]
     assert far.cov[2, 2] > 20.0 * alone
+    predicted = predict(graph, 2, placed)
+    assert predicted is not None and np.allclose(predicted.cov, far.cov), "before the keyframe is solved again as well"
