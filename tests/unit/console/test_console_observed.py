@@ -62,11 +62,13 @@ LOST, WIDEN, WHOLE, ASK = m.Verdict.LOST, m.SearchStep.WIDEN, m.SearchStep.WHOLE
 
 def test_the_result_of_a_frame_is_its_last_estimate_with_the_match() -> None:
     flight = ObservedFlight()
+    flight.observer.origin_ns = frame(0).t_ns - 1_500_000_000
     outcome = flight.frame(m.Verdict.ACCEPTED)
     result = outcome.result
     assert result is not None and result.gps is not None and result.ellipse is not None
     assert (result.gps.lat, result.gps.lon, result.altitude, result.heading) == (48.0, 11.0, 600.0, 90.0)
     assert (result.match, result.inliers, result.source) == ("accepted", 12, "satellite_anchored")
+    assert result.t_s == 1.5
     assert result.ellipse.semi_major_m == pytest.approx(4.0 * math.sqrt(5.991), abs=0.01)
     assert result.confidence == pytest.approx(1.0 - math.exp(-(20.0**2) / (2 * 4.0**2)), abs=1e-4)
     assert result.heading_sigma == pytest.approx(math.degrees(0.2), abs=1e-3)

@@ -8,7 +8,7 @@ import pytest
 
 from terrafix.core.geodesy import quat_from_rot
 from terrafix.core.pnp import outlier_inflation, random_inlier_probability, solved
-from terrafix.core.pose import exp_so3
+from terrafix.core.pose import exp_so3, project_with_jacobian
 from terrafix.estimator.models.terrain import Terrain
 from terrafix.messages import MapMatch, PnpInput, Verdict
 from terrafix_tools.finalise.lens import Lens, as_described
@@ -89,6 +89,16 @@ def test_the_rows_predict_how_the_pose_changes_with_the_lens() -> None:
     predicted = -np.linalg.solve(rows[:, POSE], rows[:, K1] * change[0] + rows[:, FOCAL] * change[1])
     moved = np.concatenate([np.zeros(3), fit.r_w_c.T @ (other.p_m - fit.p_m)])
     assert predicted[5] == pytest.approx(moved[5], abs=0.08) and abs(moved[5]) > 0.3
+
+
+def test_a_slope_of_the_ground_moves_no_point_below_the_camera() -> None:
+    points = matched()
+    fit = points.fit(LENS)
+    assert fit is not None
+    ground = fit.p_m * (1.0, 1.0, 0.0) + np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]])
+    _, by_pose, _ = project_with_jacobian(fit.r_w_c, fit.p_m, ground)
+    below, aside = np.abs(points._common(by_pose, ground, fit)[:, -2:]).reshape(2, -1).max(axis=1)
+    assert below == 0.0 < aside
 
 
 def test_what_the_points_have_in_common_widens_the_pose() -> None:
