@@ -74,17 +74,10 @@ def test_beginning_and_end_of_thermal_throttle_are_warnings_with_temperature_and
         health(ThermalBand.NORMAL, 70.0, "all below 75 C"),
     ]
     lines = logged(messages, tmp_path, "WARN")
-    assert [(line["level"], line["event"]) for line in lines] == [
-        ("warning", "thermal throttle entered"),
-        ("warning", "thermal throttle left"),
-    ]
-    assert [(line["temperature_c"], line["cause"]) for line in lines] == [
-        (81.0, "gpu 81 C"),
-        (70.0, "all below 75 C"),
-    ]
-    assert [(line["covariance_mode"], line["clock_mhz"]) for line in lines] == [
-        ("jacobian", 612.0),
-        ("marginals", 612.0),
+    fields = "level", "event", "temperature_c", "cause", "covariance_mode", "clock_mhz"
+    assert [tuple(line[field] for field in fields) for line in lines] == [
+        ("warning", "thermal throttle entered", 81.0, "gpu 81 C", "jacobian", 612.0),
+        ("warning", "thermal throttle left", 70.0, "all below 75 C", "marginals", 612.0),
     ]
 
 

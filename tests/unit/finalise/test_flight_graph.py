@@ -24,7 +24,7 @@ from terrafix.messages import MapMatch, Message, SearchResult, Verdict
 from terrafix.smoother.gnc import solve
 from terrafix_tools.finalise import batch_smoother
 from terrafix_tools.finalise.batch_smoother import smooth
-from terrafix_tools.finalise.fix_consistency import information_shares, lost_sigma
+from terrafix_tools.finalise.fix_consistency import ambiguous_segments, information_shares, lost_sigma
 from terrafix_tools.finalise.flight_graph import Fix, FlightGraph, FlightReplayer, RecordedNode
 from terrafix_tools.finalise.run import refined_track
 from terrafix_tools.finalise.submaps import _moved, _submap
@@ -102,6 +102,16 @@ def test_only_a_map_match_that_nothing_contradicted_ends_the_doubt_of_the_nodes_
     inliers, begins = np.ones(2, bool), np.zeros(8, int)
     assert lost_sigma(flight, inliers, begins).tolist() == [0.0] * 3 + [800.0] * 5
     assert lost_sigma(flight, np.array([False, True]), begins).tolist() == [800.0] * 8
+
+
+@pytest.mark.parametrize("position_only", [False, True])
+def test_matches_without_a_pose_lead_to_no_second_position(position_only: bool) -> None:
+    at = [gtsam.Pose3(gtsam.Rot3(), np.array([80.0 * (i > 3), 0.0, 100.0])) for i in range(8)]
+    given: Any = {"cov": np.eye(6), "map_sigma_m": 1.0, "by_lens": None, "k1": 0.0, "tried": True, "points": None}
+    fixes = [Fix(i, pose, position_only=position_only and i > 3, **given) for i, pose in enumerate(at)]
+    inliers, begins = np.arange(8) < 4, np.zeros(8, int)
+    found = list(ambiguous_segments(fixes, inliers, begins, [at[0]] * 8))
+    assert [nodes.tolist() for nodes, _ in found] == ([] if position_only else [[4, 5, 6, 7]])
 
 
 def test_how_much_ground_two_map_matches_share_depends_on_the_height_above_it() -> None:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from recorded_flight import blind_between, errors, messages, record, replayed_graph, seen_again
-from simulated_flight import Flight, t_ns
+from simulated_flight import ORIGIN, Flight, t_ns
 from terrafix.messages import Frame, MapMatch, Message, Refinement, SourceEnded
 from terrafix_tools.before_after import kept_line
+from terrafix_tools.finalise import held_out
 from terrafix_tools.finalise.batch_smoother import smooth
 from terrafix_tools.finalise.flight_graph import HELD_OUT_RUN, FlightGraph, FlightReplayer
-from terrafix_tools.finalise.held_out import EVERY, Comparison, choose
+from terrafix_tools.finalise.held_out import EVERY, MIN_RUNS, Comparison, choose
 from terrafix_tools.finalise.run import finalise, last_lines
 
 MATCHES = 160
@@ -143,3 +144,15 @@ def test_loop_closures_bring_a_drifted_track_back_to_the_old_keyframe() -> None:
             steps_m.append(float(np.hypot(*(errors_m[last] - errors_m[KEYFRAME])[:2])))
         ratios.append(steps_m[1] / steps_m[0])
     assert float(np.median(ratios)) < 0.7
+
+
+@pytest.mark.parametrize(("more_px", "kept"), [(0.0, True), (1.0, False)])
+def test_a_lens_that_the_flight_determines_is_kept_unless_held_out_matches_are_worse_by_it(
+    monkeypatch: pytest.MonkeyPatch, more_px: float, kept: bool
+) -> None:
+    matches = np.ones(4 * MIN_RUNS * HELD_OUT_RUN)
+    monkeypatch.setattr(held_out, "smooth", lambda *_, **__: "described")
+    monkeypatch.setattr(held_out, "_estimated", lambda *_: "estimated")
+    monkeypatch.setattr(held_out, "_smoothed_px", lambda _, lens: matches + more_px * (lens == "estimated"))
+    monkeypatch.setattr(held_out, "_in_flight_px", lambda _: matches)
+    assert choose(FlightGraph(ORIGIN)).estimates_lens is kept

@@ -101,12 +101,9 @@ def test_fans_have_their_speed(tmp_path: Path) -> None:
     ],
 )
 def test_power_mode_of_nvpmodel(tmp_path: Path, status: str, modes: str, expected: str | None) -> None:
+    assert read_power_mode(tmp_path / "status", tmp_path / "modes") is None
     write(tmp_path, status=status, modes=modes)
     assert read_power_mode(tmp_path / "status", tmp_path / "modes") == expected
-
-
-def test_without_nvpmodel_there_is_no_power_mode(tmp_path: Path) -> None:
-    assert read_power_mode(tmp_path / "status", tmp_path / "modes") is None
 
 
 def test_health_and_the_line_of_a_thermal_band_have_power_and_clock_of_the_reading(tmp_path: Path) -> None:
