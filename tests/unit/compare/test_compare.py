@@ -237,6 +237,13 @@ def test_a_file_of_a_future_version_is_one_line(tmp_path: Path) -> None:
         read_record(tmp_path / "flight.mcap")
 
 
+@pytest.mark.parametrize("content", [b"", b"<html>"], ids=["empty", "no MCAP"])
+def test_a_file_that_is_no_record_is_one_line_in_compare(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "x.mcap").write_bytes(content)
+    with pytest.raises(SourceError, match="is not a flight record"):
+        read_record(tmp_path / "x.mcap")
+
+
 def test_a_truncated_record_is_compared_up_to_its_end(tmp_path: Path) -> None:
     a = record(tmp_path / "a", live_messages(200))
     b = record(tmp_path / "b", live_messages(200))

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import shutil
+import subprocess
 import sys
 from datetime import date
 from pathlib import Path
@@ -104,6 +105,14 @@ def test_a_query_writes_and_changes_nothing(fleet: Path, tmp_path: Path, sql: st
 def test_a_query_reads_no_file_beside_the_tables(fleet: Path, sql: str) -> None:
     with pytest.raises(UsageError, match="file system operations are disabled"):
         query(fleet, sql.format(file=fleet / "records.jsonl"))
+
+
+def test_a_wrong_statement_is_one_line(fleet: Path) -> None:
+    code = "from terrafix_tools.cli import main; main()"
+    command = [sys.executable, "-c", code, "fleet", "query", str(fleet), "SELEC 1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    line = 'terrafix: SQL: Parser Error: syntax error at or near "SELEC"\n'
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", line)
 
 
 @pytest.mark.parametrize("sql", ["SELECT nope FROM flights", "SELECT 1/", "SELECT CAST('x' AS INT)", "FROM flight"])

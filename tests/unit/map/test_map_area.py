@@ -113,6 +113,16 @@ def test_a_corridor_follows_the_mission_without_closing_it(tmp_path: Path) -> No
     assert inside(area, 13.15, 47.0) and inside(area, 13.3, 47.1) and not inside(area, 13.15, 47.1)
 
 
+def test_a_qgroundcontrol_plan_is_read_as_a_mission(tmp_path: Path) -> None:
+    item = {"type": "SimpleItem", "command": 16, "frame": 3, "params": [0, 0, 0, None, 47.05, 13.2, 80], "doJumpId": 1}
+    mission = {"plannedHomePosition": [47.0, 13.1, 400], "items": [item], "version": 2}
+    path = tmp_path / "m.plan"
+    path.write_text(json.dumps({"fileType": "Plan", "mission": mission}), encoding="utf-8")
+    area = read_area(str(path), corridor_km=2.0)
+    assert inside(area, 13.15, 47.025)
+    assert area.bounds_deg[0] == pytest.approx(away(13.1, 47.0, 270, 2000)[0], abs=0.001)
+
+
 def write_plan(path: Path, *items: dict[str, object]) -> Path:
     mission = {"plannedHomePosition": [47.0, 13.0, 400], "items": items, "version": 2}
     path.write_text(json.dumps({"fileType": "Plan", "mission": mission}), encoding="utf-8")

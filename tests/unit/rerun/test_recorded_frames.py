@@ -127,6 +127,11 @@ def test_start_of_a_record_cannot_be_changed(tmp_path: Path) -> None:
     assert isinstance(error, UsageError) and "omit --start" in str(error)
 
 
+def test_frames_of_what_is_no_record_are_refused(tmp_path: Path) -> None:
+    error = replay(tmp_path, "--frames", "--out", tmp_path / "out")
+    assert isinstance(error, UsageError) and "--frames is for flight records" in str(error)
+
+
 def test_other_inputs_need_the_frames(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", [origin(), frame(0)])
     error = replay(tmp_path, "--map", "a.tif", "--out", tmp_path / "out")
