@@ -17,7 +17,16 @@ from terrafix.core.flight_id import live_flight_id
 from terrafix.core.frames import FrameWriter
 from terrafix.core.initial_position import Bounds, map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import Edge, NodeContext
-from terrafix.messages import OVERTAKEN, Exposure, Health, Message, SourceEnded, SourceFacts
+from terrafix.messages import (
+    OVERTAKEN,
+    Exposure,
+    Frame,
+    Health,
+    Message,
+    NavEstimate,
+    SourceEnded,
+    SourceFacts,
+)
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_configured
 from terrafix.vision.sources.exposed import ReportedExposures
@@ -91,6 +100,9 @@ class SourceEdge:
                 self._frames.put(shot.frame.frame_id, shot.image)
             frame = self._exposures.exposed(shot.frame) if self._source.live else shot.frame
             messages += [*shot.imu, *shot.states, *shot.others, frame]
+            if self._rate is not None:
+                with self._changed:
+                    messages += self._rate.published([one for one in messages if isinstance(one, Frame)], now_ns)
         elif ended and not self._end_published:
             self._reading.result()  # re-raises an exception of the reader thread in this process
             self._end_published = True
@@ -98,11 +110,15 @@ class SourceEdge:
         return messages
 
     def on_message(self, message: Message) -> None:
-        """Takes the thermal band of Health, and exposures."""
+        """Takes the thermal band of Health, exposures, and when estimates came."""
         if isinstance(message, Exposure):
             self._exposures.add(message)
-        if isinstance(message, Health) and self._rate is not None:
-            self._rate.band = message.band
+        if self._rate is not None and isinstance(message, Health | NavEstimate):
+            with self._changed:
+                if isinstance(message, Health):
+                    self._rate.band = message.band
+                else:
+                    self._rate.on_estimate(message)
 
     def close(self) -> None:
         self._stopping.set()
@@ -149,11 +165,10 @@ class SourceEdge:
         return Shot(frame, states, shot.image, imu, others)
 
     def _push(self, shot: Shot) -> None:
-        if self._rate is not None and not self._rate.takes_frame(shot.frame.t_ns):
-            with self._changed:
-                self._dropped.extend((*shot.imu, *shot.states, *shot.others))
-            return
         with self._changed:
+            if self._rate is not None and not self._rate.takes_frame(shot.frame.t_ns):
+                self._dropped.extend((*shot.imu, *shot.states, *shot.others))
+                return
             if not self._realtime and not self._source.live:  # lossless: the reader blocks until there is room
                 self._changed.wait_for(lambda: len(self._shots) < QUEUE_SHOTS or self._stopping.is_set())
             self._count += 1

@@ -11,6 +11,7 @@ from terrafix.messages import (
     EkfStatus,
     Fact,
     Frame,
+    FrameRate,
     GnssState,
     GnssVerdict,
     Health,
@@ -69,6 +70,14 @@ def test_a_3d_fix_has_its_accuracy_position_and_source() -> None:
     assert position["radius_95_m"] == 9.8  # 4 m times the square root of 5.991
     assert position["source"] == "satellite_anchored" and position["agl_m"] == 100.0 and position["speed_mps"] == 10.0
     assert "3D fix, accuracy 5.0 m" in text_of(found) and "map match" in text_of(found)
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_the_rate_at_which_frames_are_taken_is_a_fact(slow: bool) -> None:
+    rate = FrameRate(t_ns=0, offered_hz=2.0, taken_hz=1.33, every=1, computer_too_slow=slow)
+    found = after(1.0, (0.5, rate))
+    assert found["frame_rate"]["taken_hz"] == 1.33 and after(1.0)["frame_rate"] is None
+    assert "running at 1.3 of 2 Hz" in text_of(found) and ("the computer is too slow" in text_of(found)) is slow
 
 
 def test_what_the_source_says_of_itself_is_a_fact() -> None:

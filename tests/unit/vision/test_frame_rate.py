@@ -1,12 +1,19 @@
-"""Frame rate of a live source by thermal band."""
+"""Frame rate of a live source: by thermal band, and by what the computer finishes in time."""
 
 import itertools
+from collections.abc import Callable
 
 import pytest
 
+from link_rig import estimate, texts
 from terrafix.core.config import HealthSection
-from terrafix.messages import ThermalBand
-from terrafix.vision.frame_rate import FrameRateLimit
+from terrafix.link.node import LinkNode
+from terrafix.messages import OVERTAKEN, CalibrationFault, Frame, FrameRate, Message, NavEstimate, ThermalBand
+from terrafix.vision.frame_rate import FRAMES, MAX_WAIT_NS, MIN_TAKEN_HZ, WAIT_NS, FrameRateLimit
+from terrafix_tools.estimates import Row
+from terrafix_tools.flight_verdict import flight_verdict
+
+S, MS = 10**9, 10**6
 
 
 def limit_of(band: ThermalBand) -> FrameRateLimit:
@@ -50,3 +57,129 @@ def test_the_normal_band_takes_every_frame_at_once_after_a_hot_one_also_one_whos
     limit.band = ThermalBand.NORMAL
     assert limit.takes_frame(10**9 + 1)
     assert limit.takes_frame(10**9 - 1)
+
+
+# --- by what the computer finishes in time ---
+
+
+def frame_at(t_ns: int, frame_id: int, error: str = "") -> Frame:
+    return Frame(t_ns=t_ns, frame_id=frame_id, file="", width=640, height=480, error=error)
+
+
+class Computer:
+    """Needs ``took_ms`` from a frame to its position (None: it leaves the frame out), and its camera ``camera_ms``."""
+
+    def __init__(self) -> None:
+        self.limit = limit_of(ThermalBand.NORMAL)
+        self.taken_s: list[float] = []
+        self.states: list[FrameRate] = []
+        self.faults: list[CalibrationFault] = []
+        self._frame_id, self._due = 0, list[NavEstimate]()
+
+    def run(
+        self, seconds: float, took_ms: Callable[[int], float | None], rate_hz: float = 2.0, camera_ms: float = 0.0
+    ) -> "Computer":
+        """``took_ms`` of the number of the frame, those that are not taken counted as well."""
+        for _ in range(round(seconds * rate_hz)):
+            t_ns, took = round(self._frame_id * S / rate_hz), took_ms(self._frame_id)
+            for placed in self._due:
+                if placed.emitted_at_ns <= t_ns:
+                    self.limit.on_estimate(placed)
+            self._due = [placed for placed in self._due if placed.emitted_at_ns > t_ns]
+            if self.limit.takes_frame(t_ns):
+                self.taken_s.append(t_ns / S)
+                frame = frame_at(t_ns, self._frame_id, OVERTAKEN if took is None else "")
+                for published in self.limit.published([frame], t_ns + round(camera_ms * MS)):
+                    (self.states if isinstance(published, FrameRate) else self.faults).append(published)  # type: ignore[attr-defined]
+                if took is not None:
+                    self._due.append(estimate(t_ns, late_ns=round(took * MS), frame_id=self._frame_id))
+            self._frame_id += 1
+        return self
+
+    @property
+    def changes(self) -> list[int]:
+        """``every`` of the FrameRates, each that differs from the one before."""
+        return [every for every, _ in itertools.groupby(state.every for state in self.states)]
+
+
+def test_a_computer_that_keeps_up_takes_all_and_says_so_once_a_second() -> None:
+    computer = Computer().run(60.0, lambda _: 300.0)
+    assert len(computer.taken_s) == 120 and computer.changes == [1]
+    assert all(not s.computer_too_slow and s.offered_hz == s.taken_hz == 2.0 for s in computer.states)
+    assert 55 <= len(computer.states) <= 60
+
+
+def test_one_that_is_too_slow_takes_fewer_evenly_until_they_have_their_positions_in_time() -> None:
+    computer = Computer().run(20.0, lambda _: 100.0).run(60.0, lambda _: 900.0)
+    assert computer.changes == [1, 2]
+    last = computer.states[-1]
+    assert (last.offered_hz, last.taken_hz, last.computer_too_slow) == (2.0, 1.0, True)
+    assert {b - a for a, b in itertools.pairwise(computer.taken_s[-30:])} == {1.0}
+
+
+def test_it_takes_all_again_once_it_has_been_fast_enough_for_a_while() -> None:
+    computer = Computer().run(40.0, lambda _: 900.0).run(40.0, lambda _: 150.0)
+    assert computer.changes == [1, 2, 1] and not computer.states[-1].computer_too_slow
+    assert 40.0 + WAIT_NS / S <= next(s.t_ns for s in reversed(computer.states) if s.every == 2) / S <= 55.0
+
+
+def test_a_rate_that_has_failed_is_tried_ever_more_rarely() -> None:
+    """Positions are in time at half of the rate, where there seems to be room for all, and late at the whole."""
+    computer = Computer()
+    computer.run(600.0, lambda _: 100.0 if computer.states and computer.states[-1].every > 1 else 900.0)
+    tried_s = [b.t_ns / S for a, b in itertools.pairwise(computer.states) if b.every == 1 < a.every]
+    waits_s = [b - a for a, b in itertools.pairwise(tried_s)]
+    assert len(tried_s) >= 5 and waits_s == sorted(waits_s) and waits_s[-1] > MAX_WAIT_NS / S
+
+
+@pytest.mark.parametrize("rate_hz", [0.3, 2.0, 30.0])
+def test_no_fewer_than_the_least_rate_are_taken_however_slow_it_is(rate_hz: float) -> None:
+    last = Computer().run(200.0, lambda _: None, rate_hz).states[-1]
+    assert last.computer_too_slow and last.taken_hz >= min(rate_hz, MIN_TAKEN_HZ)
+
+
+def test_frames_that_lose_their_position_on_the_way_are_late() -> None:
+    """The estimator gets every third frame of a camera of 30 Hz: of others it takes the newest alone."""
+    limit, published = limit_of(ThermalBand.NORMAL), list[Message]()
+    for i in range(FRAMES):
+        limit.takes_frame(i * S // 30)
+        published += limit.published([frame_at(i * S // 30, i)], i * S // 30)
+        if i % 3 == 0:
+            limit.on_estimate(estimate(i * S // 30, late_ns=30 * MS, frame_id=i))
+    rate, fault = published[-2:]
+    assert isinstance(rate, FrameRate) and rate.every == 2
+    assert isinstance(fault, CalibrationFault) and fault.active and fault.t_ns == S // 30
+
+
+def test_the_pilot_reads_the_rate_and_the_verdict_names_the_span() -> None:
+    computer = Computer().run(20.0, lambda _: 100.0).run(40.0, lambda _: 900.0).run(40.0, lambda _: 100.0)
+    node, heard = LinkNode(10.0), list[Message]()
+    for fault in computer.faults:
+        node.tick(fault.t_ns)
+        heard += node.on(fault)
+    assert texts(heard) == [
+        "Terrafix: computer too slow: running at 1 of 2 Hz",
+        "Terrafix: computer keeps up again",
+    ]
+    rows, faults = [Row(file="", t_s=100.0)], [(fault.t_ns / S, fault) for fault in computer.faults]
+    ((from_s, to_s, which),) = flight_verdict(rows, faults).refused
+    assert from_s == 20.0 and 65.0 <= to_s <= 75.0 and which == "computer too slow"
+
+
+@pytest.mark.parametrize(
+    ("took_ms", "camera_ms", "slow"), [(300, 0, False), (700, 0, True), (700, 600, False), (1300, 600, True)]
+)
+def test_positions_that_come_after_the_next_frame_are_late_and_a_slow_camera_is_not(
+    took_ms: int, camera_ms: int, slow: bool
+) -> None:
+    computer = Computer().run(60.0, lambda _: took_ms, camera_ms=camera_ms)
+    assert (computer.changes != [1]) is slow
+
+
+def test_a_few_frames_that_are_left_out_are_no_slow_computer_nor_are_unreadable_ones() -> None:
+    assert Computer().run(50.0, lambda i: None if i % 4 == 0 else 100.0).changes == [1]
+    limit = limit_of(ThermalBand.NORMAL)
+    published = [
+        x for i in range(100) if limit.takes_frame(i * S) for x in limit.published([frame_at(i * S, i, "cut")], i * S)
+    ]
+    assert all(isinstance(x, FrameRate) and not x.computer_too_slow for x in published) and published

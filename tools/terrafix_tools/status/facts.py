@@ -2,11 +2,13 @@
 
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from terrafix.core.gate import CHI2_95
 from terrafix.messages import (
     EkfStatus,
+    FrameRate,
     GpsInput,
     Health,
     LinkStatus,
@@ -21,20 +23,19 @@ from terrafix_tools.report.text import FIX_3D
 from terrafix_tools.status.processes import ProcessState
 from terrafix_tools.status.state import RATED, Status
 
-SILENT_S = (
-    2.0  # age of GPS_INPUT or of LinkStatus from which the link counts as silent [spec: GPS_INPUT 10, status 1 Hz]
-)
+SILENT_S = 2.0  # age of GPS_INPUT or LinkStatus from which the link is silent [spec: GPS_INPUT 10, status 1 Hz]
 
 
 def facts(status: Status, processes: list[ProcessState], now_ns: int) -> dict[str, Any]:
     """-> source, position, autopilot, processes, rates, computer and log; None: not known (yet)."""
-    source = status.last(SourceFacts)
+    source, rate = status.last(SourceFacts), status.last(FrameRate)
     return {
         "source": None if source is None else [fact._asdict() for fact in source.facts],
         "position": _position(status, now_ns),
         "autopilot": _autopilot(status, now_ns),
         "processes": [_process(status, process) for process in processes],
         "rates_hz": {kind.__name__: round(status.rate_hz(kind, now_ns), 1) for kind in RATED},
+        "frame_rate": None if rate is None else msgspec.structs.asdict(rate),
         "delay_ms": _rounded(status.delay_ms(), 0),
         "map_matches_accepted": _rounded(status.matched_share(), 2),
         "dropped": {f"{process}: {kind}": count for (process, kind), count in sorted(status.dropped.items())},

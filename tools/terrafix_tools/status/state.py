@@ -10,6 +10,7 @@ from terrafix.messages import (
     Dropped,
     EkfStatus,
     Frame,
+    FrameRate,
     GnssVerdict,
     GpsInput,
     Health,
@@ -33,6 +34,7 @@ from terrafix.messages import (
 KINDS: tuple[type[Message], ...] = (
     SourceFacts,
     Frame,
+    FrameRate,
     Odometry,
     MapMatch,
     NavEstimate,
