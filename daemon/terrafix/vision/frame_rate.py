@@ -1,5 +1,5 @@
-"""Which frames are taken from a source in real time: fewer in a hot computer, and on one that is too slow for all of
-them, evenly, so that each that is taken has its position in time."""
+"""Which frames are taken from a source in real time: fewer in a hot computer, and on one that cannot finish all of them
+only as many as it finishes, evenly."""
 
 import math
 from collections import deque
@@ -14,17 +14,19 @@ FRAMES = 10  # newest frames that are counted [spec: 5 s at the default frame ra
 # Late ones of these on a computer that is too slow: one that keeps the promise (5 %) has four once in a thousand.
 TOO_SLOW_FRAMES = 4  # [spec: AC-7 and the binomial distribution]
 MAX_COMPUTING_NS = 400_000_000  # from image to position [spec: AC-7, the floor]
-MIN_TAKEN_HZ = 0.5  # an older image is not predicted to the present [spec: MAX_PREDICTION_AGE_NS of the link]
+MIN_TAKEN_HZ = 1.0  # with its delay an image is predicted to the present [spec: MAX_PREDICTION_AGE_NS of the link]
 SLOWER = 1.5  # ratio of one interval of the frames that are taken to the next longer one [tuned]
-# Hysteresis. Frames come at the next higher rate once they would have this share of their time, and that since WAIT_NS;
-# where that rate has failed before, since twice the time, up to MAX_WAIT_NS. [tuned]
-ROOM, WAIT_NS, MAX_WAIT_NS = 0.75, 5 * NS_PER_S, 80 * NS_PER_S
+# Hysteresis: frames come at the next higher rate when none was lost for WAIT_NS; where that rate has failed before, for
+# twice the time, up to MAX_WAIT_NS. [tuned]
+WAIT_NS, MAX_WAIT_NS = 5 * NS_PER_S, 80 * NS_PER_S
+STAGES = 2  # vision and estimator: each has one interval for a frame [spec: the process table]
 
 
 @dataclass
 class _Taken:
     t_ns: int
-    late: bool  # left out, or its position came late
+    late: bool  # its position came late, or not at all: a newer frame was there first, or has its position
+    lost: bool  # not at all, when there were positions of frames before
     took_ns: int | None = None  # from its message to its position; None: none yet
 
 
@@ -41,6 +43,7 @@ class FrameRateLimit:
         self._due_ns = 0
         self.band = ThermalBand.NORMAL
         self._offered_ns: deque[int] = deque(maxlen=FRAMES)  # times of the newest frames of the source
+        self._begun = False  # a frame has had its position
         self._every, self._skipped = 1, 0  # of so many frames one is taken; frames since the last one
         self._newest: dict[int, _Taken] = {}  # by frame id, of FRAMES
         self._transport_ns = MAX_COMPUTING_NS  # least time from the stamp of a frame to its message: the camera's
@@ -65,7 +68,8 @@ class FrameRateLimit:
         """``frames``: that were taken, with pixels or left out. -> the FrameRate that is due: at each change, and once
         a second; with a change the fault by its cause, from the first frame that came late."""
         for frame in frames:
-            self._newest[frame.frame_id] = _Taken(frame.t_ns, frame.error == OVERTAKEN)
+            left_out = frame.error == OVERTAKEN
+            self._newest[frame.frame_id] = _Taken(frame.t_ns, left_out, left_out and self._begun)
             if len(self._newest) > FRAMES:
                 del self._newest[next(iter(self._newest))]
             self._transport_ns = min(self._transport_ns, now_ns - frame.t_ns)
@@ -76,6 +80,7 @@ class FrameRateLimit:
             return []
         self._state, self._state_ns = known, now_ns
         taken_hz = min(offered_hz, NS_PER_S / (self._period_ns[self.band] or 1)) / self._every
+        taken_hz *= 1.0 - sum(taken.lost for taken in self._newest.values()) / max(len(self._newest), 1)
         rate = FrameRate(
             t_ns=now_ns,
             offered_hz=round(offered_hz, 2),
@@ -83,22 +88,25 @@ class FrameRateLimit:
             every=self._every,
             computer_too_slow=slow,
         )
-        if before == known or not (slow or before[0]):
+        if slow == before[0] and not (slow and self._every > before[1]):
             return [rate]
         t_ns = now_ns if before[0] or self._slow_since_ns is None else self._slow_since_ns
-        detail = f"running at {taken_hz:.2g} of {offered_hz:.2g} Hz"
+        late = sum(taken.late for taken in self._newest.values())
+        rates = f"running at {taken_hz:.2g} of {offered_hz:.2g} Hz"
+        detail = f"{late} of {FRAMES} frames late" if round(taken_hz, 1) >= round(offered_hz, 1) else rates
         return [rate, CalibrationFault(t_ns=t_ns, quantity=TOO_SLOW, factor=None, detail=detail, active=slow)]
 
     def on_estimate(self, estimate: NavEstimate) -> None:
-        """Late is a position that comes after the next frame, and later than what is promised; and a frame that has
-        none when a newer one has."""
+        """Late is a position that comes after the next frame, and later than what is promised."""
         placed = self._newest.get(estimate.frame_id)
         if placed is None or placed.took_ns is not None:
             return
         placed.took_ns = estimate.emitted_at_ns - placed.t_ns - self._transport_ns
         placed.late = placed.late or placed.took_ns > max(MAX_COMPUTING_NS, self._interval_ns)
         for taken in self._newest.values():
-            taken.late = taken.late or (taken.took_ns is None and taken.t_ns < placed.t_ns)
+            if taken.took_ns is None and taken.t_ns < placed.t_ns:
+                taken.late, taken.lost = True, taken.lost or self._begun
+        self._begun = True
         self._adapt(estimate.emitted_at_ns)
 
     @property
@@ -114,28 +122,27 @@ class FrameRateLimit:
         return (times_ns[-1] - times_ns[0]) // max(len(times_ns) - 1, 1)
 
     def _adapt(self, now_ns: int) -> None:
+        lost = sum(taken.lost for taken in self._newest.values())
         late_ns = [taken.t_ns for taken in self._newest.values() if taken.late]
-        longest = max(1, math.floor(self._offered_hz / MIN_TAKEN_HZ))
-        faster = int(self._every / SLOWER)
         if len(late_ns) >= TOO_SLOW_FRAMES:
             self._slow_since_ns = self._slow_since_ns or late_ns[0]
-            if self._every < longest:
-                failed = now_ns - self._raised_ns < 2 * self._wait_ns
-                self._wait_ns = min(2 * self._wait_ns, MAX_WAIT_NS) if failed else WAIT_NS
-                self._take_one_of(min(math.ceil(SLOWER * self._every), longest), now_ns)
-        elif self._every == 1:
+        elif self._every == 1 and len(self._newest) == FRAMES:  # not with the first frames of a rate that is tried
             self._slow_since_ns = None
-        elif not late_ns and now_ns - self._stepped_ns > self._wait_ns and self._has_room(faster):
-            self._raised_ns = now_ns
-            self._slow_since_ns = self._slow_since_ns if faster > 1 else None
-            self._take_one_of(faster, now_ns)
-
-    def _has_room(self, every: int) -> bool:
-        """Whether frames at a higher rate would have their positions in time."""
-        took_ns = sorted(taken.took_ns for taken in self._newest.values() if taken.took_ns is not None)
-        limit_ns = max(MAX_COMPUTING_NS, self._interval_ns * every // self._every)
-        return len(took_ns) >= FRAMES - 1 and took_ns[-2] < ROOM * limit_ns
-
-    def _take_one_of(self, every: int, now_ns: int) -> None:
+        slower = min(math.ceil(SLOWER * self._every), max(1, math.floor(self._offered_hz / MIN_TAKEN_HZ)))
+        faster = int(self._every / SLOWER)
+        if slower > self._every and lost >= FRAMES * (1.0 - self._every / slower):  # no more are finished than at it
+            failed = now_ns - self._raised_ns < 2 * self._wait_ns
+            self._wait_ns = min(2 * self._wait_ns, MAX_WAIT_NS) if failed else WAIT_NS
+            every = slower
+        elif self._every > 1 and not lost and now_ns - self._stepped_ns > self._wait_ns and self._has_room(faster):
+            self._raised_ns, every = now_ns, faster
+        else:
+            return
         self._every, self._skipped, self._stepped_ns = every, 0, now_ns
         self._newest.clear()  # what was late at the other rate says nothing of this one
+
+    def _has_room(self, every: int) -> bool:
+        """Whether each of two stages could finish a frame in its interval at a higher rate."""
+        took_ns = sorted(taken.took_ns for taken in self._newest.values() if taken.took_ns is not None)
+        limit_ns = max(MAX_COMPUTING_NS, STAGES * self._interval_ns * every // self._every)
+        return len(took_ns) >= FRAMES - 1 and took_ns[-2] < limit_ns
