@@ -43,7 +43,7 @@ class FrameRateLimit:
         self._due_ns = 0
         self.band = ThermalBand.NORMAL
         self._offered_ns: deque[int] = deque(maxlen=FRAMES)  # times of the newest frames of the source
-        self._begun = False  # a frame has had its position
+        self._begun = False  # there was a position
         self._every, self._skipped = 1, 0  # of so many frames one is taken; frames since the last one
         self._newest: dict[int, _Taken] = {}  # by frame id, of FRAMES
         self._transport_ns = MAX_COMPUTING_NS  # least time from the stamp of a frame to its message: the camera's
@@ -68,11 +68,13 @@ class FrameRateLimit:
         """``frames``: that were taken, with pixels or left out. -> the FrameRate that is due: at each change, and once
         a second; with a change the fault by its cause, from the first frame that came late."""
         for frame in frames:
+            self._transport_ns = min(self._transport_ns, now_ns - frame.t_ns)
+            if frame.t_ns + self._transport_ns < self._stepped_ns:  # taken at the rate before
+                continue
             left_out = frame.error == OVERTAKEN
             self._newest[frame.frame_id] = _Taken(frame.t_ns, left_out, left_out and self._begun)
             if len(self._newest) > FRAMES:
                 del self._newest[next(iter(self._newest))]
-            self._transport_ns = min(self._transport_ns, now_ns - frame.t_ns)
             self._adapt(now_ns)
         slow, offered_hz = self._slow_since_ns is not None, self._offered_hz
         before, known = self._state, (slow, self._every)
@@ -98,15 +100,14 @@ class FrameRateLimit:
 
     def on_estimate(self, estimate: NavEstimate) -> None:
         """Late is a position that comes after the next frame, and later than what is promised."""
-        placed = self._newest.get(estimate.frame_id)
+        placed, begun, self._begun = self._newest.get(estimate.frame_id), self._begun, True
         if placed is None or placed.took_ns is not None:
             return
         placed.took_ns = estimate.emitted_at_ns - placed.t_ns - self._transport_ns
         placed.late = placed.late or placed.took_ns > max(MAX_COMPUTING_NS, self._interval_ns)
         for taken in self._newest.values():
             if taken.took_ns is None and taken.t_ns < placed.t_ns:
-                taken.late, taken.lost = True, taken.lost or self._begun
-        self._begun = True
+                taken.late, taken.lost = True, taken.lost or begun
         self._adapt(estimate.emitted_at_ns)
 
     @property

@@ -150,6 +150,13 @@ def test_a_rate_that_has_failed_is_tried_ever_more_rarely() -> None:
     assert len(tried_s) >= 5 and waits_s == sorted(waits_s) and waits_s[-1] > MAX_WAIT_NS / S
 
 
+def test_frames_of_one_moment_without_the_processor_lower_the_rate_once() -> None:
+    computer = Computer().run(10.0, lambda _: 10.0, 30.0)
+    left_out = [frame_at(10 * S + i * S // 30, 300 + i, OVERTAKEN) for i in range(60)]
+    rates = [x for x in computer.limit.published(left_out, 12 * S) if isinstance(x, FrameRate)]
+    assert [rate.every for rate in rates] == [2]
+
+
 @pytest.mark.parametrize("rate_hz", [0.3, 2.0, 30.0])
 def test_no_fewer_than_the_least_rate_are_taken_however_slow_it_is(rate_hz: float) -> None:
     computer = Computer().run(10.0, lambda _: 10.0, rate_hz).run(200.0, lambda _: None, rate_hz)
