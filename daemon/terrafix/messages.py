@@ -11,8 +11,10 @@ Conventions
 * The value ``None`` means unknown, which is a valid state of a field.
 """
 
+import functools
+import operator
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import UNSET, UnsetType
@@ -159,6 +161,7 @@ class SourceFacts(Message, frozen=True, kw_only=True):
 
 
 OVERTAKEN = "overtaken: a newer frame was there first"  # error of a frame that was left out, not of the camera
+TOO_SLOW = "computer too slow"  # for all frames: quantity of a CalibrationFault
 
 
 # 1-sigma of the time stamp of a frame against its exposure: exposure, readout and transfer of USB cameras [s].
@@ -947,6 +950,15 @@ class Health(Message, frozen=True, kw_only=True):
     clock_mhz: float | None = None  # ... and limit_mhz of that processor
 
 
+class FrameRate(Message, frozen=True, kw_only=True):
+    """Frames a second that a source in real time offers, and that are taken from it: at each change, and at 1 Hz."""
+
+    offered_hz: float
+    taken_hz: float  # fewer in a hot computer, and in one that is too slow
+    every: int  # one of so many is taken, where the computer is too slow for more
+    computer_too_slow: bool
+
+
 class ProcessEvent(Message, frozen=True, kw_only=True):
     """A process started, died, was restarted or given up; published by the supervisor."""
 
@@ -983,52 +995,5 @@ class LogLine(Message, frozen=True, kw_only=True):
     fields: dict[str, str | int | float | bool | None] = {}
 
 
-AnyMessage = (
-    Origin
-    | SourceFacts
-    | Frame
-    | VehicleState
-    | Imu
-    | GimbalAttitude
-    | Exposure
-    | SourceEnded
-    | Odometry
-    | Relocalization
-    | Prediction
-    | MapMatch
-    | ModelEvent
-    | SearchState
-    | SearchPlaces
-    | PositionHint
-    | EkfDeadReckoning
-    | HintVerdict
-    | InitialPosition
-    | NavEstimate
-    | PoseSolution
-    | CalibrationFault
-    | CalibrationEstimate
-    | ClaimBudget
-    | PoseLink
-    | PoseAnchor
-    | Refinement
-    | MeasurementVerdict
-    | GpsInput
-    | LinkStatus
-    | ServedVehicle
-    | CandidateAttitude
-    | CameraVehicle
-    | GnssReading
-    | GnssInitialPosition
-    | GnssVerdict
-    | MapOffset
-    | PositionSource
-    | EkfStatus
-    | WallClock
-    | StatusText
-    | ThermalReading
-    | Health
-    | ProcessEvent
-    | InputOrder
-    | Dropped
-    | LogLine
-)
+ALL_MESSAGES: tuple[type[Message], ...] = tuple(Message.__subclasses__())  # of this module
+AnyMessage: Any = functools.reduce(operator.or_, ALL_MESSAGES)  # their union, for decoders

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from terrafix import messages
-from terrafix.processes import ALL_MESSAGES, PROCESSES
+from terrafix.processes import PROCESSES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "architecture.md"
 
@@ -12,7 +12,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "architecture.md"
 def process_table() -> str:
     rows = ["| process | subscribes to | publishes | tick rate | time-out without progress |", "|---|---|---|---|---|"]
     for process in PROCESSES:
-        subscribes = "all messages" if process.subscribes == ALL_MESSAGES else _names(process.subscribes)
+        subscribes = "all messages" if process.subscribes == messages.ALL_MESSAGES else _names(process.subscribes)
         newest = f" (of queued {_names(process.newest)} only the newest)" if process.newest else ""
         ticks = f"{process.tick_hz:g} Hz" if process.tick_hz else "-"
         publishes = _names(process.publishes)

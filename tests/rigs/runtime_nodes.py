@@ -15,7 +15,7 @@ from terrafix import messages as m
 from terrafix.core.errors import LinkError
 from terrafix.core.frames import FrameWriter
 from terrafix.core.node import Edge, Node, NodeBase, NodeContext
-from terrafix.processes import ALL_MESSAGES, Process
+from terrafix.processes import Process
 
 CAMERA = m.Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
 ORIGIN = origin_of(CAMERA)
@@ -162,7 +162,7 @@ def process_name() -> str:
 
 _BASE = Process("", "runtime_nodes", (), (), 0.0, 5.0)
 TABLE: tuple[Process, ...] = (
-    replace(_BASE, name="recorder", subscribes=ALL_MESSAGES, tick_hz=1.0),
+    replace(_BASE, name="recorder", subscribes=m.ALL_MESSAGES, tick_hz=1.0),
     replace(_BASE, name="link", subscribes=(m.Origin,), publishes=(m.LinkStatus,), tick_hz=50.0, stuck_after_s=1.0),
     replace(
         _BASE,

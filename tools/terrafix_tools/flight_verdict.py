@@ -18,9 +18,8 @@ from terrafix.recorder.reader import read_flight
 from terrafix_tools.estimates import NS, Row, RowTable
 from terrafix_tools.likely_cause import likely_cause
 
-MAX_UNCONFIRMED_S = DEGRADATION_LEVELS[1][
-    0
-]  # time that a flight may last on its initial position before a map match confirms it
+# Time that a flight may last on its initial position before a map match confirms it
+MAX_UNCONFIRMED_S = DEGRADATION_LEVELS[1][0]
 MAX_UNANCHORED_S = DEGRADATION_LEVELS[-1][0]  # longest time without a map match later on
 MAX_REJECTED_SHARE, MIN_MATCHES = 0.5, 8  # of the poses found on the map, rejected by the estimator's innovation gate
 # Faults that begin in flight; all others are of the description, which was wrong from the beginning.

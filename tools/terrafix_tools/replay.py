@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from terrafix.map.package import MapPackage
 from terrafix.messages import Message, Origin, SourceEnded, SourceFacts
 from terrafix.processes import PROCESSES
 from terrafix.recorder.provenance import header, versions
-from terrafix.vision.sources import Source, open_configured
+from terrafix.vision.sources import Shot, Source, open_configured
 from terrafix.vision.sources.facts import facts_of
 from terrafix.vision.sources.stream_address import is_live
 from terrafix_engines.runtime import ModelFileError
@@ -98,8 +99,11 @@ def replay(
     opened, source = flight, wrap_source(flight)
     package = package_of(_map_of(map_path, config, source), progress=progress)
     origin, map_summary = _check_map(package, source.origin())
+    shots: Iterator[Shot] | None = None
     if not origin.flight_id:
-        first = next(opened.shots(), None)
+        first = next(decoded := opened.shots(), None)
+        if source is opened and first is not None:  # the first image is not decoded again
+            shots = chain((first,), decoded)
         flight_id = recorded_flight_id(origin, None if first is None else first.image)
         origin = msgspec.structs.replace(origin, flight_id=flight_id)
     facts = facts_of(opened)
@@ -133,7 +137,7 @@ def replay(
             begun = earlier.frames, begin_with(earlier, made, published, step_done)
             output.copy_images(earlier.record)
             earlier.record.unlink()
-        _feed_flight(source, begun, shell, frames, published, output, watch, progress)
+        _feed_flight(shots or source.shots(), source.length(), begun, shell, frames, published, output, watch, progress)
         counts = output.counts()
         if UNMEASURED in counts["verdict"]["cause"] and not isinstance(opened, RecordedFrames):
             counts = output.counts(likely_factor(opened.shots(), origin, package))
@@ -168,7 +172,8 @@ def peak_memory_mb() -> float:
 
 
 def _feed_flight(
-    source: Source,
+    shots: Iterator[Shot],
+    length: int | None,
     begun: tuple[int, int],
     shell: InProcessShell,
     frames: MemoryFrameStore,
@@ -180,8 +185,7 @@ def _feed_flight(
     """Feeds the frames one after the other. ``begun``: number of frames before them, and time of the last [ns].
     Recording is outside the measured time: in flight it is another process."""
     count, last_ns = begun
-    shots = source.shots()
-    with _bar(progress, source.length()) as step:
+    with _bar(progress, length) as step:
         while True:
             began_s = time.perf_counter()
             shot = next(shots, None)  # reads and decodes the image

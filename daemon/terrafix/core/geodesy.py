@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,14 @@ def local_crs(lat_deg: float, lon_deg: float) -> "CRS":
     from pyproj import CRS  # imported here: link and vision use only the rotations, and must restart quickly
 
     return CRS.from_proj4(LOCAL.format(lat_deg=lat_deg, lon_deg=lon_deg) + " +datum=WGS84 +units=m")
+
+
+@lru_cache(maxsize=16)
+def transformer(source: "CRS | int", target: "CRS | str") -> "Transformer":
+    """From x and y to x and y, for pyproj; each pair costs a look-up in its database of 10 to 25 ms once."""
+    from pyproj import Transformer
+
+    return Transformer.from_crs(source, target, always_xy=True)
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,11 @@ from terrafix.link.output import gps_report
 from terrafix.link.output.gps_time import LatchedClock
 from terrafix.link.output.send_schedule import SendSchedule
 from terrafix.link.pilot_text.debounce import Debounce
-from terrafix.link.pilot_text.frame_load import FrameLoad
 from terrafix.link.pilot_text.statustext import CRITICAL, INFO, LINK_FAULTS, NOTICE, WARNING, fault_text, statustext
 from terrafix.messages import (
     NO_FRAME_ID,
     CalibrationFault,
     EkfStatus,
-    Frame,
     GnssReading,
     GpsInput,
     Health,
@@ -102,7 +100,6 @@ class LinkNode:
         self._gnss = GnssMonitor(gnss, map_offsets, on_vision=on_vision)
         self._starts = GnssInitializer(enabled=gnss_start)
         self._prior_request = PriorRequest()
-        self._frame_load = FrameLoad()
         self._ekf_monitor = EkfStatusMonitor()
         self._candidates: list[int] = []  # of ServedVehicle
         self._armed: bool | None = None
@@ -127,7 +124,6 @@ class LinkNode:
         self._level_debounce.reported = 0
         self._highest_level = 0  # highest degradation level since the last map fix
         self._handlers: dict[type, Callable[[Any], list[Message]]] = {
-            Frame: self._on_frame,
             NavEstimate: self._on_estimate,
             VehicleState: self._on_vehicle_state,
             Imu: self._on_imu,
@@ -152,13 +148,8 @@ class LinkNode:
         self._now_ns = now_ns
         return self._send(now_ns) if self._schedule.due(now_ns) else ()
 
-    def _on_frame(self, frame: Frame) -> list[Message]:
-        faults = self._frame_load.on_frame(frame, max(self._now_ns, frame.t_ns))
-        return [*faults, *(text for fault in faults for text in self._on_calibration_fault(fault))]
-
     def _on_estimate(self, estimate: NavEstimate) -> list[Message]:
         now_ns = max(self._now_ns, estimate.emitted_at_ns)  # the last tick may be older than the estimate
-        self._frame_load.on_estimate(estimate)
         verdict, detail = self._gate.evaluate(estimate, now_ns, self._inertial, self._ground_amsl_m)
         if verdict is Verdict.ACCEPTED or (self._gate.pending_jump and detail == self._gate.pending_jump):
             self._newest_estimate_ns = max(self._newest_estimate_ns or 0, estimate.t_ns)

@@ -1,8 +1,9 @@
 """Elevation of a map package, sampled in the coordinates of a local frame."""
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS
 
+from terrafix.core.geodesy import transformer
 from terrafix.map.format import DEM_TILE_PX, ELEVATION_TABLE, DemGrid
 from terrafix.map.tile_cache import TileStore
 
@@ -16,7 +17,7 @@ class ElevationView:
     def __init__(self, grid: DemGrid, tiles: TileStore, local: CRS, crs: CRS) -> None:
         self._grid = grid
         self._tiles = tiles
-        self._to_crs = Transformer.from_crs(local, crs, always_xy=True)
+        self._to_crs = transformer(local, crs)
 
     def at(self, e_m: np.ndarray, n_m: np.ndarray) -> np.ndarray:
         """Local coordinates (any shape, metres) -> height AMSL in metres, float64, same shape. NaN where unknown."""

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS
 
+from terrafix.core.geodesy import transformer
 from terrafix.map.format import TILE_PX, Layer, Level
 from terrafix.map.tile_cache import TileStore
 
@@ -48,7 +49,7 @@ class LayerView:
     def __init__(self, layer: Layer, tiles: TileStore, local: CRS) -> None:
         self._layer = layer
         self._tiles = tiles
-        self.to_crs = Transformer.from_crs(local, layer.crs, always_xy=True)
+        self.to_crs = transformer(local, layer.crs)
         self.bounds_m: tuple[float, float, float, float] = self.to_crs.transform_bounds(
             *layer.bounds, densify_pts=51, direction="INVERSE"
         )

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from terrafix.core.errors import MapError
-from terrafix.core.geodesy import LocalFrame, local_crs
+from terrafix.core.geodesy import LocalFrame, local_crs, transformer
 from terrafix.core.signature import TrustedKey
 from terrafix.map.checksum import file_digest_matches
 from terrafix.map.dem import ElevationView
@@ -40,9 +40,7 @@ class MapPackage:
         self._close = weakref.finalize(self, db.close)
         self.tiles = TileStore(db)
         self.crs = CRS.from_user_input(manifest.crs)
-        self._from_wgs84 = {
-            layer.table: Transformer.from_crs(4326, layer.crs, always_xy=True) for layer in manifest.layers
-        }
+        self._from_wgs84 = {layer.table: transformer(4326, layer.crs) for layer in manifest.layers}
         self._verified_vectors: set[str] = set()
 
     @classmethod

@@ -8,7 +8,7 @@ import msgspec
 from terrafix import messages as m
 from terrafix.messages import Message
 
-MESSAGE_TYPES: dict[str, type[Message]] = {t.__name__: t for t in m.AnyMessage.__args__}
+MESSAGE_TYPES: dict[str, type[Message]] = {t.__name__: t for t in m.ALL_MESSAGES}
 
 
 @cache

@@ -11,13 +11,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import msgspec
 
+from terrafix import messages as m
 from terrafix.core.clock import now_ns
 from terrafix.core.errors import SourceError
 from terrafix.core.flight_id import live_flight_id
 from terrafix.core.frames import FrameWriter
 from terrafix.core.initial_position import Bounds, map_bounds, start_is_unknown, with_map_center
 from terrafix.core.node import Edge, NodeContext
-from terrafix.messages import OVERTAKEN, Exposure, Health, Message, SourceEnded, SourceFacts
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_configured
 from terrafix.vision.sources.exposed import ReportedExposures
@@ -58,7 +58,7 @@ class SourceEdge:
         self._changed = threading.Condition()
         self._shots: deque[Shot] = deque()
         self._exposures = ReportedExposures()
-        self._dropped: deque[Message] = deque(maxlen=MAX_DROPPED_MESSAGES)
+        self._dropped: deque[m.Message] = deque(maxlen=MAX_DROPPED_MESSAGES)
         self._stopping = threading.Event()
         self._count = 0
         self._end_published = False
@@ -67,7 +67,7 @@ class SourceEdge:
         self._reading: Future[None] | None = self._start(now_ns()) if source.live else None
         self._origin_published = False
 
-    def poll(self, now_ns: int) -> Iterable[Message]:
+    def poll(self, now_ns: int) -> Iterable[m.Message]:
         if self._reading is None:
             self._reading = self._start(now_ns)
         if not self._origin_published:
@@ -76,7 +76,7 @@ class SourceEdge:
                 self._source.origin() if self._bounds is None else with_map_center(self._source.origin(), self._bounds)
             )
             ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
-            said = SourceFacts(t_ns=self._zero_ns, facts=tuple(facts_of(self._source)))
+            said = m.SourceFacts(t_ns=self._zero_ns, facts=tuple(facts_of(self._source)))
             flight_id = live_flight_id(self._zero_ns)
             origin = msgspec.structs.replace(origin, t_ns=self._zero_ns, ground_amsl_m=ground_m, flight_id=flight_id)
             return [origin, said]
@@ -91,18 +91,25 @@ class SourceEdge:
                 self._frames.put(shot.frame.frame_id, shot.image)
             frame = self._exposures.exposed(shot.frame) if self._source.live else shot.frame
             messages += [*shot.imu, *shot.states, *shot.others, frame]
+            if self._rate is not None:
+                with self._changed:
+                    messages += self._rate.published([one for one in messages if isinstance(one, m.Frame)], now_ns)
         elif ended and not self._end_published:
             self._reading.result()  # re-raises an exception of the reader thread in this process
             self._end_published = True
-            messages.append(SourceEnded(t_ns=now_ns, frames=self._source.length() or self._count))
+            messages.append(m.SourceEnded(t_ns=now_ns, frames=self._source.length() or self._count))
         return messages
 
-    def on_message(self, message: Message) -> None:
-        """Takes the thermal band of Health, and exposures."""
-        if isinstance(message, Exposure):
+    def on_message(self, message: m.Message) -> None:
+        """Takes the thermal band of Health, exposures, and when estimates came."""
+        if isinstance(message, m.Exposure):
             self._exposures.add(message)
-        if isinstance(message, Health) and self._rate is not None:
-            self._rate.band = message.band
+        if self._rate is not None and isinstance(message, m.Health | m.NavEstimate):
+            with self._changed:
+                if isinstance(message, m.Health):
+                    self._rate.band = message.band
+                else:
+                    self._rate.on_estimate(message)
 
     def close(self) -> None:
         self._stopping.set()
@@ -149,11 +156,10 @@ class SourceEdge:
         return Shot(frame, states, shot.image, imu, others)
 
     def _push(self, shot: Shot) -> None:
-        if self._rate is not None and not self._rate.takes_frame(shot.frame.t_ns):
-            with self._changed:
-                self._dropped.extend((*shot.imu, *shot.states, *shot.others))
-            return
         with self._changed:
+            if self._rate is not None and not self._rate.takes_frame(shot.frame.t_ns):
+                self._dropped.extend((*shot.imu, *shot.states, *shot.others))
+                return
             if not self._realtime and not self._source.live:  # lossless: the reader blocks until there is room
                 self._changed.wait_for(lambda: len(self._shots) < QUEUE_SHOTS or self._stopping.is_set())
             self._count += 1
@@ -161,7 +167,7 @@ class SourceEdge:
             if len(self._shots) > 1 and (self._realtime or self._source.live):  # the newest first, and it alone
                 old = self._shots.popleft()
                 self._dropped.extend((*old.imu, *old.states, *old.others))
-                self._dropped.append(msgspec.structs.replace(old.frame, error=old.frame.error or OVERTAKEN))
+                self._dropped.append(msgspec.structs.replace(old.frame, error=old.frame.error or m.OVERTAKEN))
 
 
 def make_edge(ctx: NodeContext) -> Edge:

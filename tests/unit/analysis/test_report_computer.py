@@ -1,6 +1,6 @@
 """Charts of the computer's temperature and power in the report."""
 
-from terrafix.messages import Health, ThermalBand, ThermalReading
+from terrafix.messages import FrameRate, Health, ThermalBand, ThermalReading
 from terrafix_tools.report.data import FlightView
 from terrafix_tools.report.sections_computer import computer
 
@@ -41,3 +41,12 @@ def test_load_is_drawn_for_all_cores_and_by_process() -> None:
     assert 'aria-label="All cores"' in page and 'aria-label="By process"' in page
     assert "vision" in page and "link" in page
     assert "Processor load" not in _load_page({}, {})
+
+
+def test_the_frame_rate_is_stated_where_the_computer_was_too_slow() -> None:
+    def page(slow: bool) -> str:
+        rate = FrameRate(t_ns=0, offered_hz=2.0, taken_hz=1.33, every=1, computer_too_slow=slow)
+        return computer(FlightView(title="test", rows=[], frame_ids=[], frame_rates=[(5.0, rate), (9.0, rate)]))
+
+    assert "from 0:05 to 0:09, running at 1.3 of 2 Hz" in page(True)
+    assert page(False) == ""

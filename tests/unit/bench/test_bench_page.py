@@ -38,13 +38,14 @@ FLIGHT: dict[str, Any] = {
             "peak_memory_mb": 300.0,
         }
     },
-    "baseline": {
-        "method": "SIFT <old>",
-        "cpu_ms": spread(600.0),
-        "cpu_ms_with_map_points_kept": spread(200.0),
-        "accuracy": accuracy(0.0),
+    "peers": {
+        "SIFT <old>": {
+            "cpu_ms": spread(600.0),
+            "cpu_ms_with_map_points_kept": spread(200.0),
+            "accuracy": accuracy(0.0),
+        },
+        "XFeat": {"cpu_ms": None, "cpu_ms_with_map_points_kept": None, "accuracy": accuracy(0.5)},
     },
-    "peers": {"XFeat": {"cpu_ms": None, "cpu_ms_with_map_points_kept": None, "accuracy": accuracy(0.5)}},
     "missing": ["XFeat: not there"],
     "floor": {
         "anchor": {
@@ -70,9 +71,9 @@ def test_every_method_has_a_row_with_the_frames_that_it_found() -> None:
         ("XFeat", 4, 8),
     ]
     assert comparison_table(FLIGHT)[1:4] == [
-        ["Terrafix, weights-free", "7/8", "100/200/300", "-", "25 %"],
-        ["... the map matching of it", "7/8", "80/160/240", "-", "25 %"],
-        ["SIFT <old>", "0/8", "600/1200/1800", "200/400/600", "-"],
+        ["Terrafix, weights-free", "7/8", "100/200/300", "-", "-", "25 %"],
+        ["... the map matching of it", "7/8", "80/160/240", "-", "-", "25 %"],
+        ["SIFT <old>", "0/8", "600/1200/1800", "200/400/600", "0.17/0.17", "-"],
     ]
 
 
@@ -89,7 +90,7 @@ def test_the_page_has_the_tables_the_picture_and_what_was_not_measured(tmp_path:
     write_page(tmp_path / "docs" / "benchmark.md", RESULT)
     text = (tmp_path / "docs" / "benchmark.md").read_text()
     assert text == page(RESULT)
-    assert "| ... the map matching of it | 7/8 | 80/160/240 | - | 25 % |" in text
+    assert "| ... the map matching of it | 7/8 | 80/160/240 | - | - | 25 % |" in text
     assert "First frame 800 ms of the processor, start-up 1.5 s by the clock, 300 MB." in text
     assert "Not measured: XFeat: not there." in text and "Not measured: flight town-a: not there." in text
     assert all(len(line) <= 160 or line.startswith("|") for line in text.splitlines())

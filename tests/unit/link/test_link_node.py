@@ -293,6 +293,7 @@ def test_a_small_jump_within_the_claimed_covariance_is_accepted() -> None:
         ({"velocity_sigma_mps": math.inf}, m.Verdict.IMPLAUSIBLE),
         ({"emitted_at_ns": 0}, m.Verdict.IMPLAUSIBLE),  # in the future
         ({"emitted_at_ns": 200 * S}, m.Verdict.STALE),
+        ({"emitted_at_ns": 101_100 * MS}, m.Verdict.STALE),  # without readings since
     ],
 )
 def test_an_implausible_or_stale_estimate_is_rejected_with_a_reason(

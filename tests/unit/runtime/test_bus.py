@@ -18,7 +18,7 @@ from runtime_nodes import ORIGIN, frame, prediction
 from terrafix import messages as m
 from terrafix.core import logs
 from terrafix.core.node import Edge, Node, NodeBase
-from terrafix.processes import ALL_MESSAGES, Process
+from terrafix.processes import Process
 from terrafix.runtime.bus import BUS_QUEUE_LENGTH, Publisher, Subscriber
 from terrafix.runtime.executor import LiveShell
 from terrafix.runtime.progress_stamp import Progress
@@ -175,7 +175,7 @@ class SlowNode(NodeBase):
 
 SLOW = Process("slow", "", (m.Prediction,), (m.MapMatch,), 0.0, 1.0, (m.Prediction,))
 PUBLISHER = Process("publisher", "", (), (m.Prediction,), 0.0, 1.0)
-LISTENER = Process("listener", "", ALL_MESSAGES, (), 0.0, 1.0)
+LISTENER = Process("listener", "", m.ALL_MESSAGES, (), 0.0, 1.0)
 
 
 @pytest.mark.slow
@@ -184,7 +184,7 @@ def test_a_slow_process_handles_the_newest_prediction_and_reports_the_skipped_on
     shell = bus.shell(SLOW, (PUBLISHER, LISTENER), SlowNode())
     progress = Progress(bus.run_dir.progress("slow"))
     publisher = bus.publisher("publisher")
-    listener = bus.subscriber("slow", *ALL_MESSAGES)
+    listener = bus.subscriber("slow", *m.ALL_MESSAGES)
     thread = threading.Thread(target=shell.run, args=(stop.is_set,))
     thread.start()
     received: list[m.Message] = []

@@ -6,27 +6,7 @@ import pytest
 from rich.console import Console
 
 from flight_records import estimate, gps_input
-from terrafix.messages import (
-    Dropped,
-    EkfStatus,
-    Fact,
-    Frame,
-    GnssState,
-    GnssVerdict,
-    Health,
-    LinkStatus,
-    MapMatch,
-    MeasurementVerdict,
-    Message,
-    ProcessEvent,
-    SearchState,
-    SearchStep,
-    SourceFacts,
-    StatusText,
-    ThermalBand,
-    ThermalReading,
-    Verdict,
-)
+from terrafix import messages as m
 from terrafix_tools.status.facts import facts
 from terrafix_tools.status.line import line_of
 from terrafix_tools.status.processes import ProcessState
@@ -37,7 +17,7 @@ S = 1_000_000_000  # ns
 USES_POSITION, NO_POSITION = 16, 1  # EKF_STATUS_FLAGS
 
 
-def after(seconds: float, *received: tuple[float, Message]) -> dict[str, Any]:
+def after(seconds: float, *received: tuple[float, m.Message]) -> dict[str, Any]:
     """Facts ``seconds`` after the beginning, with messages at their times of reception [s]."""
     status = Status(0)
     for at_s, message in received:
@@ -52,14 +32,14 @@ def text_of(found: dict[str, Any]) -> str:
     return console.export_text()
 
 
-def link_status() -> LinkStatus:
-    return LinkStatus(
+def link_status() -> m.LinkStatus:
+    return m.LinkStatus(
         t_ns=0, connected=True, autopilot="ardupilot", sysid=1, sent=10, received=20, bad=0, time_offset_ms=1.0
     )
 
 
-def frame(i: int) -> Frame:
-    return Frame(t_ns=i, frame_id=i, file="", width=64, height=48)
+def frame(i: int) -> m.Frame:
+    return m.Frame(t_ns=i, frame_id=i, file="", width=64, height=48)
 
 
 def test_a_3d_fix_has_its_accuracy_position_and_source() -> None:
@@ -71,8 +51,16 @@ def test_a_3d_fix_has_its_accuracy_position_and_source() -> None:
     assert "3D fix, accuracy 5.0 m" in text_of(found) and "map match" in text_of(found)
 
 
+@pytest.mark.parametrize("slow", [False, True])
+def test_the_rate_at_which_frames_are_taken_is_a_fact(slow: bool) -> None:
+    rate = m.FrameRate(t_ns=0, offered_hz=2.0, taken_hz=1.33, every=1, computer_too_slow=slow)
+    found = after(1.0, (0.5, rate))
+    assert found["frame_rate"]["taken_hz"] == 1.33 and after(1.0)["frame_rate"] is None
+    assert "running at 1.3 of 2 Hz" in text_of(found) and ("the computer is too slow" in text_of(found)) is slow
+
+
 def test_what_the_source_says_of_itself_is_a_fact() -> None:
-    said = SourceFacts(t_ns=0, facts=(Fact("clock", "by arrival"),))
+    said = m.SourceFacts(t_ns=0, facts=(m.Fact("clock", "by arrival"),))
     assert after(1.0, (0.5, said))["source"] == [{"topic": "clock", "text": "by arrival"}]
     assert after(1.0)["source"] is None
 
@@ -105,17 +93,17 @@ def test_the_delay_is_the_median_from_the_exposure_to_the_estimate() -> None:
 
 
 def test_the_share_of_accepted_map_matches() -> None:
-    verdicts = [Verdict.ACCEPTED, Verdict.AMBIGUOUS, Verdict.ACCEPTED, Verdict.ACCEPTED]
-    matches = [(1.0, MapMatch(t_ns=i, frame_id=i, verdict=v, matcher="gradient")) for i, v in enumerate(verdicts)]
+    verdicts = [m.Verdict.ACCEPTED, m.Verdict.AMBIGUOUS, m.Verdict.ACCEPTED, m.Verdict.ACCEPTED]
+    matches = [(1.0, m.MapMatch(t_ns=i, frame_id=i, verdict=v, matcher="gradient")) for i, v in enumerate(verdicts)]
     assert after(2.0, *matches)["map_matches_accepted"] == 0.75
     assert after(2.0)["map_matches_accepted"] is None
 
 
 def test_restarts_losses_and_loads_are_counted_by_process() -> None:
-    died = ProcessEvent(t_ns=0, process="vision", event="died", detail="killed by signal 9")
-    restarted = ProcessEvent(t_ns=0, process="vision", event="restarted", detail="pid 7")
-    thermal = ThermalReading(t_ns=0, zones=[], throttling=[], disk_free_mb=1, cpu_load={"all": 0.5, "vision": 0.25})
-    lost = Dropped(t_ns=0, process="anchor", message="Prediction", count=4)
+    died = m.ProcessEvent(t_ns=0, process="vision", event="died", detail="killed by signal 9")
+    restarted = m.ProcessEvent(t_ns=0, process="vision", event="restarted", detail="pid 7")
+    thermal = m.ThermalReading(t_ns=0, zones=[], throttling=[], disk_free_mb=1, cpu_load={"all": 0.5, "vision": 0.25})
+    lost = m.Dropped(t_ns=0, process="anchor", message="Prediction", count=4)
     found = after(
         2.0, (0.1, died), (0.2, restarted), (0.3, died), (0.4, restarted), (0.5, thermal), (1.0, lost), (1.1, lost)
     )
@@ -129,8 +117,10 @@ def test_restarts_losses_and_loads_are_counted_by_process() -> None:
 
 @pytest.mark.parametrize(("flags", "uses"), [(USES_POSITION, True), (NO_POSITION, False)])
 def test_the_autopilot_its_ekf_and_the_judge_of_its_receivers(flags: int, uses: bool) -> None:
-    spoofed = GnssVerdict(t_ns=0, receiver=0, state=GnssState.SPOOFED, distance_m=212.4, sigmas=9.0, reason="212 m off")
-    ekf = EkfStatus(t_ns=0, flags=flags, position_ratio=0.25, velocity_ratio=0.1)
+    spoofed = m.GnssVerdict(
+        t_ns=0, receiver=0, state=m.GnssState.SPOOFED, distance_m=212.4, sigmas=9.0, reason="212 m off"
+    )
+    ekf = m.EkfStatus(t_ns=0, flags=flags, position_ratio=0.25, velocity_ratio=0.1)
     found = after(1.0, (0.5, link_status()), (0.6, ekf), (0.7, spoofed))["autopilot"]
     assert found["connected"] and found["uses_position"] is uses and found["position_test_ratio"] == 0.25
     assert found["gnss"] == {"0": {"state": "spoofed", "distance_m": 212.0, "why": "212 m off"}}
@@ -139,11 +129,11 @@ def test_the_autopilot_its_ekf_and_the_judge_of_its_receivers(flags: int, uses: 
 
 def test_the_newest_rejections_and_texts_come_first_and_old_ones_go() -> None:
     verdicts = [
-        MeasurementVerdict(t_ns=i, frame_id=i, measurement="map", verdict=Verdict.INNOVATION, detail=f"{i} m")
+        m.MeasurementVerdict(t_ns=i, frame_id=i, measurement="map", verdict=m.Verdict.INNOVATION, detail=f"{i} m")
         for i in range(LINES + 3)
     ]
-    accepted = MeasurementVerdict(t_ns=9, frame_id=9, measurement="map", verdict=Verdict.ACCEPTED)
-    said = StatusText(t_ns=0, severity=4, text="position lost")
+    accepted = m.MeasurementVerdict(t_ns=9, frame_id=9, measurement="map", verdict=m.Verdict.ACCEPTED)
+    said = m.StatusText(t_ns=0, severity=4, text="position lost")
     found = after(1.0, *((0.1, v) for v in verdicts), (0.2, accepted), (0.3, said))
     assert found["rejected"] == [f"map innovation: {i} m" for i in range(LINES + 2, 2, -1)]
     assert found["texts"] == ["position lost"]
@@ -151,8 +141,8 @@ def test_the_newest_rejections_and_texts_come_first_and_old_ones_go() -> None:
 
 
 def test_heat_is_shown_with_its_band() -> None:
-    hot = Health(
-        t_ns=0, band=ThermalBand.HOT, temperature_c=84.2, throttled=True, disk_free_mb=900, cause="cpu", power_w=14.7
+    hot = m.Health(
+        t_ns=0, band=m.ThermalBand.HOT, temperature_c=84.2, throttled=True, disk_free_mb=900, cause="cpu", power_w=14.7
     )
     found = after(1.0, (0.5, hot))
     assert found["computer"] | {"load": None} == {
@@ -177,8 +167,8 @@ def test_all_types_that_are_read_are_taken() -> None:
     status = Status(0)
     for _, message in ((0, frame(0)), (0, gps_input(0))):
         status.take(0, message)
-    assert status.last(Frame) == frame(0) and status.last(Dropped) is None
-    assert status.age_s(Frame, 3 * S) == 3.0 and status.age_s(Dropped, S) is None
+    assert status.last(m.Frame) == frame(0) and status.last(m.Dropped) is None
+    assert status.age_s(m.Frame, 3 * S) == 3.0 and status.age_s(m.Dropped, S) is None
 
 
 def test_the_line_of_a_run_says_where_it_is_by_what_and_which_processes_are_down() -> None:
@@ -187,5 +177,7 @@ def test_the_line_of_a_run_says_where_it_is_by_what_and_which_processes_are_down
     assert line.startswith("3D fix to 5.0 m, ") and "100 m above ground" in line
     assert "by map match, 95 % within 9.8 m" in line
     assert line.endswith("ardupilot connected, without anchor")
-    lost = line_of(after(1.0, (0.9, gps_input(S, fix_type=1)), (0.9, SearchState(t_ns=0, step=SearchStep.WHOLE_MAP))))
+    lost = line_of(
+        after(1.0, (0.9, gps_input(S, fix_type=1)), (0.9, m.SearchState(t_ns=0, step=m.SearchStep.WHOLE_MAP)))
+    )
     assert lost == "no fix: no estimate yet, search: whole_map, no autopilot, without anchor"

@@ -9,22 +9,12 @@ import msgspec
 import pytest
 
 from source_folders import flight, picture, source_of
+from terrafix import messages as m
 from terrafix.core.clock import now_ns
 from terrafix.core.config import Config, HealthSection, SourceSection
 from terrafix.core.errors import SourceError, UsageError
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.node import NodeContext
-from terrafix.messages import (
-    OVERTAKEN,
-    Frame,
-    Health,
-    Message,
-    Origin,
-    SourceEnded,
-    SourceFacts,
-    ThermalBand,
-    VehicleState,
-)
 from terrafix.vision.edge import SourceEdge, make_edge
 from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import Shot, Source, open_source
@@ -38,25 +28,25 @@ class Listener:
 
     def __init__(self, edge: SourceEdge) -> None:
         self.edge = edge
-        self.messages: list[Message] = []
+        self.messages: list[m.Message] = []
         self.heard_ns: dict[int, int] = {}
 
     def until(self, true: Callable[[], bool], limit_s: float = 10.0) -> None:
         end_ns = now_ns() + round(limit_s * 1e9)
         while not true():
-            assert now_ns() < end_ns, f"never happened; messages: {[type(m).__name__ for m in self.messages]}"
+            assert now_ns() < end_ns, f"never happened; messages: {[type(x).__name__ for x in self.messages]}"
             for message in self.edge.poll(now_ns()):
                 self.messages.append(message)
-                if isinstance(message, Frame):
+                if isinstance(message, m.Frame):
                     self.heard_ns[message.frame_id] = now_ns()
             time.sleep(0.002)
 
     @property
-    def frames(self) -> list[Frame]:
-        return [m for m in self.messages if isinstance(m, Frame)]
+    def frames(self) -> list[m.Frame]:
+        return [x for x in self.messages if isinstance(x, m.Frame)]
 
     def ended(self) -> bool:
-        return any(isinstance(m, SourceEnded) for m in self.messages)
+        return any(isinstance(x, m.SourceEnded) for x in self.messages)
 
 
 Listen = Callable[..., Listener]
@@ -81,12 +71,12 @@ def listen() -> Iterator[Listen]:
 def test_a_recording_plays_in_real_time(tmp_path: Path, listen: Listen) -> None:
     listener = listen(flight(tmp_path / "f", 4, step_s=0.1))
     listener.until(listener.ended)
-    assert isinstance(listener.messages[0], Origin)
+    assert isinstance(listener.messages[0], m.Origin)
     zero_ns = listener.messages[0].t_ns
     assert [f.t_ns - zero_ns for f in listener.frames] == [i * 100_000_000 for i in range(4)]
     for frame in listener.frames:
         assert listener.heard_ns[frame.frame_id] >= frame.t_ns  # not before its time
-    states = [m for m in listener.messages if isinstance(m, VehicleState)]
+    states = [x for x in listener.messages if isinstance(x, m.VehicleState)]
     assert [s.t_ns for s in states] == [f.t_ns for f in listener.frames]
     assert listener.messages[-1].frames == 4  # type: ignore[attr-defined]
     assert list(listener.edge.poll(now_ns())) == []  # the end is published once
@@ -97,7 +87,7 @@ def test_what_the_source_says_of_itself_is_published_after_its_origin(tmp_path: 
     listener = listen(source)
     listener.until(lambda: len(listener.messages) > 1)
     origin, said = listener.messages[:2]
-    assert isinstance(said, SourceFacts) and said.t_ns == origin.t_ns
+    assert isinstance(said, m.SourceFacts) and said.t_ns == origin.t_ns
     assert said.facts == tuple(facts_of(source)) and {"camera", "rate"} <= {fact.topic for fact in said.facts}
 
 
@@ -134,8 +124,8 @@ def test_the_newest_frame_is_delivered_and_dropped_frames_are_published_with_an_
     assert [f.frame_id for f in listener.frames] == list(range(10))
     whole = [f.frame_id for f in listener.frames if not f.error]
     assert whole == [0, 9]
-    assert {f.error for f in listener.frames} == {"", OVERTAKEN}
-    times = [m.t_ns for m in listener.messages[1:-1]]
+    assert {f.error for f in listener.frames} == {"", m.OVERTAKEN}
+    times = [x.t_ns for x in listener.messages[1:-1]]
     assert times == sorted(times)
 
 
@@ -146,7 +136,7 @@ def test_an_exception_in_the_reader_thread_ends_the_process(listen: Listen) -> N
 
 
 def test_frame_ids_of_a_camera_increase_over_a_restart(listen: Listen) -> None:
-    frames = (Frame(t_ns=now_ns(), frame_id=i, file="", width=320, height=240) for i in range(2))
+    frames = (m.Frame(t_ns=now_ns(), frame_id=i, file="", width=320, height=240) for i in range(2))
     store = MemoryFrameStore()
     camera = source_of(lambda: (Shot(frame, (), picture(frame.frame_id)) for frame in frames))
     listener = listen(camera, now_ns() - 5 * 10**9, store=store)
@@ -167,7 +157,7 @@ def test_make_edge_reads_the_configuration(tmp_path: Path) -> None:
     assert edge is not None
     origin, _ = edge.poll(now_ns())
     edge.close()
-    assert isinstance(origin, Origin) and (origin.lat_deg, origin.lon_deg) == (10.0, 20.0)
+    assert isinstance(origin, m.Origin) and (origin.lat_deg, origin.lon_deg) == (10.0, 20.0)
     with pytest.raises(UsageError):
         make_edge(context(path=folder, start="here"))
     with pytest.raises(SourceError, match="no source given"):
@@ -183,7 +173,7 @@ def test_the_ground_height_of_the_map_is_the_default_for_a_source_without_one(
     source.origin = lambda: known  # type: ignore[method-assign]
     listener = listen(source, None, False, ground_amsl_m=612.0)
     listener.until(listener.ended)
-    assert isinstance(listener.messages[0], Origin) and listener.messages[0].ground_amsl_m == expected_m
+    assert isinstance(listener.messages[0], m.Origin) and listener.messages[0].ground_amsl_m == expected_m
 
 
 def test_in_a_hot_computer_frames_above_the_rate_are_left_out_and_their_telemetry_is_not(
@@ -192,12 +182,12 @@ def test_in_a_hot_computer_frames_above_the_rate_are_left_out_and_their_telemetr
     limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
     listener = listen(flight(tmp_path / "f", 20, step_s=0.05), rate=limit)
     listener.edge.on_message(
-        Health(t_ns=0, band=ThermalBand.HOT, temperature_c=85.0, throttled=False, disk_free_mb=None, cause="test")
+        m.Health(t_ns=0, band=m.ThermalBand.HOT, temperature_c=85.0, throttled=False, disk_free_mb=None, cause="test")
     )
     listener.until(listener.ended)
     assert [f.frame_id for f in listener.frames] == [0, 4, 8, 12, 16]
     assert not any(f.error for f in listener.frames)
-    assert len([m for m in listener.messages if isinstance(m, VehicleState)]) == 20
+    assert len([x for x in listener.messages if isinstance(x, m.VehicleState)]) == 20
     assert listener.messages[-1].frames == 20  # type: ignore[attr-defined]
 
 
@@ -205,7 +195,7 @@ def test_a_recording_that_is_not_played_in_real_time_is_read_whole_in_a_hot_comp
     tmp_path: Path, listen: Listen
 ) -> None:
     limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
-    limit.band = ThermalBand.HOT
+    limit.band = m.ThermalBand.HOT
     listener = listen(flight(tmp_path / "f", 12, step_s=0.05), realtime=False, rate=limit)
     listener.until(listener.ended)
     assert len(listener.frames) == 12

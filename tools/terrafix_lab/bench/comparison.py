@@ -18,6 +18,7 @@ class Row:
     cpu_ms: dict[str, float] | None
     kept_ms: dict[str, float] | None = None
     model_rate: float | None = None
+    ratio: tuple[float, float] | None = None  # of our processor times to those of a peer: median and 95 %
     ours: bool = False
 
 
@@ -30,10 +31,11 @@ def compared(flight: dict[str, Any]) -> list[Row]:
         found, rate = round(frames * accuracy["within_20m"]), accuracy["model_rate"]
         rows.append(Row(f"Terrafix, {kind}", found, frames, run["cpu_ms"], None, rate, ours=True))
         rows.append(Row(f"... {MATCHING}", found, frames, run["stage_cpu_ms"]["anchor"], None, rate, ours=True))
-    baseline = flight["baseline"]
-    for name, peer in ((baseline["method"], baseline), *flight["peers"].items()):
-        found = round(flight["frames"] * (peer["accuracy"]["within_20m"] or 0.0))
-        rows.append(Row(name, found, flight["frames"], peer["cpu_ms"], peer["cpu_ms_with_map_points_kept"]))
+    ours_ms = next(iter(flight["runs"].values()))["cpu_ms"]
+    for name, peer in flight["peers"].items():
+        found, ms = round(flight["frames"] * (peer["accuracy"]["within_20m"] or 0.0)), peer["cpu_ms"]
+        ratio = (ours_ms["median"] / ms["median"], ours_ms["p95"] / ms["p95"]) if ms else None
+        rows.append(Row(name, found, flight["frames"], ms, peer["cpu_ms_with_map_points_kept"], None, ratio))
     return rows
 
 

@@ -27,7 +27,8 @@ frame in milliseconds, without the first frame: median/95 %/99 %.
 
 The same frames and predictions. A peer matches points of the orthorectified frame with those of the map up to 70 m
 around it and fits a homography by RANSAC. It begins at the position that our estimator predicts, and has no odometry,
-filter or covariance of its own. *Points kept*: without the time for the points of the map."""
+filter or covariance of its own. *Points kept*: without the time for the points of the map;
+*ours by it*: ratio of processor times, median/95 %."""
 STAGES = """## Stages and their floor
 
 The floor of a stage is the processor time inside of OpenCV functions that it calls, in another replay of the same
@@ -79,10 +80,14 @@ def markdown(table: Table) -> str:
 
 
 def comparison_table(flight: dict[str, Any]) -> Table:
-    table = [["", "within 20 m", "processor time", "... points kept", "frames with the model"]]
+    table = [["", "within 20 m", "processor time", "... points kept", "ours by it", "frames with the model"]]
     for row in compared(flight):
-        found = f"{row.found}/{row.frames}"
-        table.append([row.name, found, spread_text(row.cpu_ms), spread_text(row.kept_ms), percent_text(row.model_rate)])
+        found, ratio = (
+            f"{row.found}/{row.frames}",
+            "-" if row.ratio is None else "/".join(f"{r:.2f}" for r in row.ratio),
+        )
+        times = spread_text(row.cpu_ms), spread_text(row.kept_ms)
+        table.append([row.name, found, *times, ratio, percent_text(row.model_rate)])
     return table
 
 

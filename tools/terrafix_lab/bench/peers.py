@@ -57,7 +57,7 @@ class PointMethod(Protocol):
 
 
 class SiftPoints:
-    """With the ratio test."""
+    """SIFT with the ratio test."""
 
     def __init__(self) -> None:
         self._detector, self._matcher = cv2.SIFT.create(), cv2.BFMatcher(cv2.NORM_L2)

@@ -1,9 +1,8 @@
-"""`terrafix bench`: time, memory and accuracy of whole replays, compared with peers on the same frames: SIFT + RANSAC,
-which is the baseline of all ratios, XFeat and LighterGlue.
+"""`terrafix bench`: time, memory and accuracy of whole replays, compared with peers on the same frames: SIFT, XFeat and
+LighterGlue.
 
 Every measurement runs in its own process, one after the other. Milliseconds depend on the machine and its load; the
-ratio to the baseline, measured minutes apart on the same machine, depends on them less, and the ratio of processor
-times least. These ratios are the main result."""
+ratio of the processor times to those of a peer, measured minutes apart on the same machine, depends on them least."""
 
 import json
 import os
@@ -152,23 +151,9 @@ def _flight(flight: Path, package: Path, work: Path, model: Path | None, console
             runs[kind] = _part(bench_run, flight, package, work / kind, model if kind == XFEAT else None)
     with console.status(f"{work.name}: peers"):
         found = _part(bench_peers, flight, package, work / WEIGHTS_FREE, model.parent if model else None)
-    baseline = {"method": bench_peers.SIFT, "frames": found["frames"], **found["peers"].pop(bench_peers.SIFT)}
-    ratios = {kind: _ratios(run, baseline) for kind, run in runs.items()}
     with console.status(f"{work.name}: kernels"):
         floor = _part(bench_kernels, flight, package, work / "kernels", None)
-    return {"floor": floor, "runs": runs, "baseline": baseline, "ratios": ratios, **found}
-
-
-def _ratios(run: dict[str, Any], baseline: dict[str, Any]) -> dict[str, float | None]:
-    """-> our values divided by the baseline's. Times: below 1 is faster; accuracy: above 1 is more frames."""
-    out: dict[str, float | None] = {}
-    for key in ("frame_ms", "cpu_ms"):
-        theirs_ms = baseline[key]["median"] if baseline[key] else None
-        out[key] = round(run[key]["median"] / theirs_ms, 3) if theirs_ms else None
-    for key in ("within_20m", "within_50m"):
-        theirs = baseline["accuracy"][key]
-        out[key] = round(run["accuracy"][key] / theirs, 3) if theirs else None
-    return out
+    return {"floor": floor, "runs": runs, **found}
 
 
 def _part(module: Any, flight: Path, package: Path, out: Path, model: Path | None) -> dict[str, Any]:
@@ -190,23 +175,20 @@ def _show(result: dict[str, Any], out: Path) -> None:
     console.print(f"{m['cpu']}, {m['cores']} cores, load {load} (before/after)", highlight=False)
     for name, flight in result["flights"].items():
         table = Table(title=f"{name}, {flight['frames']} frames", title_justify="left")
-        runs, baseline = flight["runs"], flight["baseline"]
         table.add_column("")
-        for kind in (*runs, baseline["method"]):
+        for kind in flight["runs"]:
             table.add_column(kind, justify="right")
-        for title, key in (("time by the baseline's", "frame_ms"), ("processor time likewise", "cpu_ms")):
-            table.add_row(title, *(_times(flight["ratios"][kind][key]) for kind in runs), "1", style="bold")
+        runs = flight["runs"].values()
         for title, key in (("frame, ms (median/p95/p99)", "frame_ms"), ("processor, ms", "cpu_ms")):
-            table.add_row(title, *(spread_text(r[key]) for r in (*runs.values(), baseline)))
-        table.add_row("first frame, ms", *(f"{r['first_frame_ms']:.0f}" for r in runs.values()), "")
+            table.add_row(title, *(spread_text(r[key]) for r in runs))
+        table.add_row("first frame, ms", *(f"{r['first_frame_ms']:.0f}" for r in runs))
         for key in ("within_20m", "within_50m"):
-            cells = [percent_text(r["accuracy"][key]) for r in (*runs.values(), baseline)]
-            table.add_row(key.replace("_", " ").replace("m", " m"), *cells)
-        cells = ["-" if (v := r["accuracy"]["median_m"]) is None else f"{v:.1f} m" for r in (*runs.values(), baseline)]
-        table.add_row("median error", *cells)
-        table.add_row("frames a second", *(f"{r['frames_per_s']:.1f}" for r in runs.values()), "")
-        table.add_row("start-up", *(f"{r['start_up_s']:.1f} s" for r in runs.values()), "")
-        table.add_row("peak memory", *(f"{r['peak_memory_mb']:.0f} MB" for r in runs.values()), "")
+            table.add_row(key.replace("_", " ").replace("m", " m"), *(percent_text(r["accuracy"][key]) for r in runs))
+        medians_m = (r["accuracy"]["median_m"] for r in runs)
+        table.add_row("median error", *("-" if error_m is None else f"{error_m:.1f} m" for error_m in medians_m))
+        table.add_row("frames a second", *(f"{r['frames_per_s']:.1f}" for r in runs))
+        table.add_row("start-up", *(f"{r['start_up_s']:.1f} s" for r in runs))
+        table.add_row("peak memory", *(f"{r['peak_memory_mb']:.0f} MB" for r in runs))
         console.print(table)
         for title, rows in (
             ("beside other methods, on the same frames and predictions (ms)", comparison_table(flight)),
@@ -215,17 +197,13 @@ def _show(result: dict[str, Any], out: Path) -> None:
             wide.print(scaling.side_by_side(title, rows))
         for what in flight["missing"]:
             console.print(f"not measured: {what}", highlight=False)
-    micro = {part: times for part, times in result["micro"].items() if isinstance(times, dict)}
     table = Table(title=f"parts, on {result['micro']['flight']}", title_justify="left")
     table.add_column("")
     table.add_column("ms (median/p95/p99)", justify="right")
-    for part, times in micro.items():
-        table.add_row(part, spread_text(times))
+    for part, times in result["micro"].items():
+        if part != "flight":
+            table.add_row(part, spread_text(times))
     console.print(table)
     if "growth" in result:
         scaling.show(result["growth"], console)
     typer.echo(f"written to {out}")
-
-
-def _times(ratio: float | None) -> str:
-    return "-" if ratio is None else f"x {ratio:.2f}"

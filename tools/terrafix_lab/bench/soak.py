@@ -43,7 +43,6 @@ SAMPLE_S = 10.0
 SETTLING_SHARE = 0.5  # of the time, before which growth is not judged
 MOST_GROWTH_PER_H = 0.01  # of memory
 GROWN = 1  # exit code
-MB = 1 << 20
 
 
 @dataclass

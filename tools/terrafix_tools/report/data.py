@@ -12,6 +12,7 @@ from terrafix.messages import (
     CalibrationFault,
     Dropped,
     EkfStatus,
+    FrameRate,
     GnssReading,
     GnssVerdict,
     GpsInput,
@@ -89,6 +90,7 @@ class FlightView:
     gnss_readings: list[tuple[float, GnssReading]] = field(default_factory=list)
     gnss_verdicts: list[tuple[float, GnssVerdict]] = field(default_factory=list)
     thermal: list[tuple[float, ThermalReading]] = field(default_factory=list)
+    frame_rates: list[tuple[float, FrameRate]] = field(default_factory=list)
     searches: list[tuple[float, SearchState]] = field(default_factory=list)
     losses: list[tuple[float, Dropped]] = field(default_factory=list)
 

@@ -24,7 +24,7 @@ KEYS = ("k-dead", "k-vis", "k-sat", "k-good", "k-ink", "k-soft")
 
 
 def computer(view: FlightView) -> str:
-    parts = [_latency(view), _load(view), _heat(view), _processes(view)]
+    parts = [_latency(view), _frame_rate(view), _load(view), _heat(view), _processes(view)]
     if not any(parts):
         return ""
     return kit.section("Computer", "", *parts)
@@ -70,6 +70,17 @@ def medians(points: list[tuple[float, float]], end: float) -> list[Point]:
     for t_s, value in points:
         parts[min(BINS - 1, max(0, int(BINS * t_s / end)))].append(value)
     return [((k + 0.5) * end / BINS, float(np.median(parts[k])) if k in parts else None) for k in range(BINS)]
+
+
+def _frame_rate(view: FlightView) -> str:
+    """When fewer frames were taken than the source offered, as the computer was too slow; "" where all were."""
+    slow = [(t_s, rate) for t_s, rate in view.frame_rates if rate.computer_too_slow]
+    if not slow:
+        return ""
+    lowest = min((rate for _, rate in slow), key=lambda rate: rate.taken_hz)
+    span = f"{stamp(slow[0][0])} to {stamp(slow[-1][0])}"
+    rates = f"running at {lowest.taken_hz:.2g} of {lowest.offered_hz:.2g} Hz at the least"
+    return kit.block("Frame rate", kit.quiet(f"The computer was too slow from {span}, {rates}."))
 
 
 def _load(view: FlightView) -> str:

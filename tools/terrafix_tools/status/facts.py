@@ -2,39 +2,29 @@
 
 from typing import Any
 
+import msgspec
 import numpy as np
 
+from terrafix import messages as m
 from terrafix.core.gate import CHI2_95
-from terrafix.messages import (
-    EkfStatus,
-    GpsInput,
-    Health,
-    LinkStatus,
-    NavEstimate,
-    PositionSource,
-    SearchState,
-    SourceFacts,
-    ThermalReading,
-)
 from terrafix_tools.report.sections_autopilot import EKF_POS_HORIZ_ABS
 from terrafix_tools.report.text import FIX_3D
 from terrafix_tools.status.processes import ProcessState
 from terrafix_tools.status.state import RATED, Status
 
-SILENT_S = (
-    2.0  # age of GPS_INPUT or of LinkStatus from which the link counts as silent [spec: GPS_INPUT 10, status 1 Hz]
-)
+SILENT_S = 2.0  # age of GPS_INPUT or LinkStatus from which the link is silent [spec: GPS_INPUT 10, status 1 Hz]
 
 
 def facts(status: Status, processes: list[ProcessState], now_ns: int) -> dict[str, Any]:
     """-> source, position, autopilot, processes, rates, computer and log; None: not known (yet)."""
-    source = status.last(SourceFacts)
+    source, rate = status.last(m.SourceFacts), status.last(m.FrameRate)
     return {
         "source": None if source is None else [fact._asdict() for fact in source.facts],
         "position": _position(status, now_ns),
         "autopilot": _autopilot(status, now_ns),
         "processes": [_process(status, process) for process in processes],
         "rates_hz": {kind.__name__: round(status.rate_hz(kind, now_ns), 1) for kind in RATED},
+        "frame_rate": None if rate is None else msgspec.structs.asdict(rate),
         "delay_ms": _rounded(status.delay_ms(), 0),
         "map_matches_accepted": _rounded(status.matched_share(), 2),
         "dropped": {f"{process}: {kind}": count for (process, kind), count in sorted(status.dropped.items())},
@@ -45,8 +35,8 @@ def facts(status: Status, processes: list[ProcessState], now_ns: int) -> dict[st
 
 
 def _position(status: Status, now_ns: int) -> dict[str, Any]:
-    sent, estimate, search = status.last(GpsInput), status.last(NavEstimate), status.last(SearchState)
-    age_s = status.age_s(GpsInput, now_ns)
+    sent, estimate, search = status.last(m.GpsInput), status.last(m.NavEstimate), status.last(m.SearchState)
+    age_s = status.age_s(m.GpsInput, now_ns)
     silent = age_s is None or age_s > SILENT_S
     has_fix = not silent and sent is not None and sent.fix_type >= FIX_3D
     found: dict[str, Any] = {
@@ -78,8 +68,8 @@ def _position(status: Status, now_ns: int) -> dict[str, Any]:
 
 
 def _autopilot(status: Status, now_ns: int) -> dict[str, Any]:
-    link, ekf, source = status.last(LinkStatus), status.last(EkfStatus), status.last(PositionSource)
-    age_s = status.age_s(LinkStatus, now_ns)
+    link, ekf, source = status.last(m.LinkStatus), status.last(m.EkfStatus), status.last(m.PositionSource)
+    age_s = status.age_s(m.LinkStatus, now_ns)
     return {
         "connected": link is not None and link.connected and age_s is not None and age_s <= SILENT_S,
         "autopilot": None if link is None else link.autopilot,
@@ -102,7 +92,7 @@ def _autopilot(status: Status, now_ns: int) -> dict[str, Any]:
 
 
 def _process(status: Status, process: ProcessState) -> dict[str, Any]:
-    event, thermal = status.events.get(process.name), status.last(ThermalReading)
+    event, thermal = status.events.get(process.name), status.last(m.ThermalReading)
     return {
         "name": process.name,
         "state": process.state,
@@ -114,7 +104,7 @@ def _process(status: Status, process: ProcessState) -> dict[str, Any]:
 
 
 def _computer(status: Status) -> dict[str, Any]:
-    health, thermal = status.last(Health), status.last(ThermalReading)
+    health, thermal = status.last(m.Health), status.last(m.ThermalReading)
     return {
         "band": None if health is None else health.band.value,
         "temperature_c": None if health is None else _rounded(health.temperature_c, 1),

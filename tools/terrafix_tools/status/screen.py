@@ -64,6 +64,10 @@ def _autopilot(found: dict[str, Any]) -> Table:
     heat = f"{computer['band'] or '-'}, {_with_unit(computer['temperature_c'], '°C')}"
     table.add_row("heat", Text(heat, BAD if computer["throttled"] or computer["band"] == "critical" else ""))
     load = None if computer["load"] is None else round(100 * computer["load"])
+    if (rate := found["frame_rate"]) is not None:
+        slow = ": the computer is too slow" if rate["computer_too_slow"] else ""
+        text = f"running at {rate['taken_hz']:.2g} of {rate['offered_hz']:.2g} Hz{slow}"
+        table.add_row("frames", Text(text, BAD if slow else ""))
     table.add_row("load, power", f"{_with_unit(load, '%')}, {_with_unit(computer['power_w'], 'W')}")
     table.add_row("disk", _with_unit(computer["disk_free_mb"], "MB free"))
     return table

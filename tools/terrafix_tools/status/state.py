@@ -4,58 +4,43 @@ from collections import Counter, defaultdict, deque
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+from terrafix import messages as m
 from terrafix.core.clock import NS_PER_S
-from terrafix.messages import (
-    CalibrationFault,
-    Dropped,
-    EkfStatus,
-    Frame,
-    GnssVerdict,
-    GpsInput,
-    Health,
-    LinkStatus,
-    MapMatch,
-    MeasurementVerdict,
-    Message,
-    ModelEvent,
-    NavEstimate,
-    Odometry,
-    PositionSource,
-    ProcessEvent,
-    SearchState,
-    SourceFacts,
-    StatusText,
-    ThermalReading,
-    Verdict,
-)
 
 # What is read from the bus.
-KINDS: tuple[type[Message], ...] = (
-    SourceFacts,
-    Frame,
-    Odometry,
-    MapMatch,
-    NavEstimate,
-    MeasurementVerdict,
-    SearchState,
-    CalibrationFault,
-    ModelEvent,
-    GpsInput,
-    LinkStatus,
-    EkfStatus,
-    GnssVerdict,
-    PositionSource,
-    StatusText,
-    Health,
-    ThermalReading,
-    ProcessEvent,
-    Dropped,
+KINDS: tuple[type[m.Message], ...] = (
+    m.SourceFacts,
+    m.Frame,
+    m.FrameRate,
+    m.Odometry,
+    m.MapMatch,
+    m.NavEstimate,
+    m.MeasurementVerdict,
+    m.SearchState,
+    m.CalibrationFault,
+    m.ModelEvent,
+    m.GpsInput,
+    m.LinkStatus,
+    m.EkfStatus,
+    m.GnssVerdict,
+    m.PositionSource,
+    m.StatusText,
+    m.Health,
+    m.ThermalReading,
+    m.ProcessEvent,
+    m.Dropped,
 )
-RATED: tuple[type[Message], ...] = (Frame, Odometry, MapMatch, NavEstimate, GpsInput)  # their rates are shown
+RATED: tuple[type[m.Message], ...] = (
+    m.Frame,
+    m.Odometry,
+    m.MapMatch,
+    m.NavEstimate,
+    m.GpsInput,
+)  # their rates are shown
 WINDOW_S = 5.0  # over which rates and delays are taken
 LINES = 5  # of rejected measurements and texts that are kept
 
-T = TypeVar("T", bound=Message)
+T = TypeVar("T", bound=m.Message)
 
 
 @dataclass
@@ -64,36 +49,36 @@ class Status:
     process; ``rejected`` and ``texts``: the newest ones; ``dropped``: lost messages by process and type."""
 
     began_ns: int
-    newest: dict[type[Message], tuple[int, Message]] = field(default_factory=dict)
-    gnss: dict[int, GnssVerdict] = field(default_factory=dict)
-    events: dict[str, ProcessEvent] = field(default_factory=dict)
+    newest: dict[type[m.Message], tuple[int, m.Message]] = field(default_factory=dict)
+    gnss: dict[int, m.GnssVerdict] = field(default_factory=dict)
+    events: dict[str, m.ProcessEvent] = field(default_factory=dict)
     restarts: Counter[str] = field(default_factory=Counter)
-    rejected: deque[MeasurementVerdict] = field(default_factory=lambda: deque(maxlen=LINES))
-    texts: deque[StatusText] = field(default_factory=lambda: deque(maxlen=LINES))
+    rejected: deque[m.MeasurementVerdict] = field(default_factory=lambda: deque(maxlen=LINES))
+    texts: deque[m.StatusText] = field(default_factory=lambda: deque(maxlen=LINES))
     dropped: Counter[tuple[str, str]] = field(default_factory=Counter)
-    _received: defaultdict[type[Message], deque[int]] = field(default_factory=lambda: defaultdict(deque))
+    _received: defaultdict[type[m.Message], deque[int]] = field(default_factory=lambda: defaultdict(deque))
     _delays_ns: deque[tuple[int, int]] = field(default_factory=deque)  # of estimates: time of reception, delay
     _matched: deque[tuple[int, bool]] = field(default_factory=deque)  # map matches: time of reception, accepted
 
-    def take(self, received_ns: int, message: Message) -> None:
+    def take(self, received_ns: int, message: m.Message) -> None:
         self.newest[type(message)] = received_ns, message
         if isinstance(message, RATED):
             self._received[type(message)].append(received_ns)
         match message:
-            case NavEstimate():
+            case m.NavEstimate():
                 self._delays_ns.append((received_ns, message.emitted_at_ns - message.t_ns))
-            case MapMatch():
-                self._matched.append((received_ns, message.verdict is Verdict.ACCEPTED))
-            case GnssVerdict():
+            case m.MapMatch():
+                self._matched.append((received_ns, message.verdict is m.Verdict.ACCEPTED))
+            case m.GnssVerdict():
                 self.gnss[message.receiver] = message
-            case ProcessEvent():
+            case m.ProcessEvent():
                 self.events[message.process] = message
                 self.restarts[message.process] += message.event == "restarted"
-            case MeasurementVerdict() if message.verdict is not Verdict.ACCEPTED:
+            case m.MeasurementVerdict() if message.verdict is not m.Verdict.ACCEPTED:
                 self.rejected.append(message)
-            case StatusText():
+            case m.StatusText():
                 self.texts.append(message)
-            case Dropped():
+            case m.Dropped():
                 self.dropped[message.process, message.message] += message.count
             case _:
                 pass
@@ -104,12 +89,12 @@ class Status:
         found = self.newest.get(kind)
         return found[1] if found is not None and isinstance(found[1], kind) else None
 
-    def age_s(self, kind: type[Message], now_ns: int) -> float | None:
+    def age_s(self, kind: type[m.Message], now_ns: int) -> float | None:
         """Since the reception of the newest message of a type; None: there was none."""
         found = self.newest.get(kind)
         return None if found is None else (now_ns - found[0]) / NS_PER_S
 
-    def rate_hz(self, kind: type[Message], now_ns: int) -> float:
+    def rate_hz(self, kind: type[m.Message], now_ns: int) -> float:
         """Messages of a type per second, over WINDOW_S, or since the status began."""
         self._forget(now_ns)
         over_s = min(WINDOW_S, (now_ns - self.began_ns) / NS_PER_S)

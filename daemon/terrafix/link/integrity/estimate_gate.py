@@ -12,7 +12,9 @@ from terrafix.messages import NavEstimate, Verdict
 
 # Jitter of clock readings between two processes. An estimate further in the future is a bug of its sender. [tuned]
 MAX_FUTURE_NS = 50_000_000
-MAX_DELAY_NS = 5_000_000_000  # on arrival, ns; too old to be predicted to the present by any means [tuned]
+# On arrival, ns. Too old to be predicted to the present by any means; and by none but the last velocity, which the
+# autopilot's own dead reckoning is better than. [tuned]
+MAX_DELAY_NS, MAX_BLIND_DELAY_NS = 5_000_000_000, 1_000_000_000
 MAX_ESTIMATE_SPEED_MPS = 100.0  # ground speed; above that of all vehicles that this is made for [tuned]
 MAX_CLIMB_MPS = 30.0  # m/s, climb or descent; same reason [tuned]
 MIN_AMSL_M, MAX_AMSL_M = -500.0, 10_000.0  # shore of the Dead Sea; above the ceiling of small vehicles [tuned]
@@ -61,7 +63,8 @@ class EstimateGate:
             return Verdict.IMPLAUSIBLE, problem
         if estimate.t_ns > now_ns + MAX_FUTURE_NS:
             return Verdict.IMPLAUSIBLE, f"from the future by {(estimate.t_ns - now_ns) / 1e6:.0f} ms"
-        if now_ns - estimate.t_ns > MAX_DELAY_NS:
+        blind = inertial.delta(estimate, now_ns) is None
+        if now_ns - estimate.t_ns > (MAX_BLIND_DELAY_NS if blind else MAX_DELAY_NS):
             return Verdict.STALE, f"{(now_ns - estimate.t_ns) / 1e9:.1f} s old on arrival"
         newest = self._candidate or self.accepted
         if newest is not None and estimate.t_ns < newest.t_ns:

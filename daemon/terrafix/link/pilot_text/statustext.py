@@ -1,9 +1,9 @@
 """STATUSTEXT messages for the pilot."""
 
-from terrafix.messages import GIMBAL_FAULTS, CalibrationFault, StatusText
+from terrafix.messages import GIMBAL_FAULTS, TOO_SLOW, CalibrationFault, StatusText
 
 CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY [spec: MAVLink MAV_SEVERITY]
-TOO_SLOW, TWO_SENDERS = "computer too slow", "telemetry of two senders"
+TWO_SENDERS = "telemetry of two senders"
 TIME_JUMPS, ATTITUDE_JUMPS = "autopilot rebooted, or its time jumps", "attitude jumps without gyros"
 # Faults that leave out frames or telemetry, by quantity: texts of their beginning and their end.
 LINK_FAULTS = {

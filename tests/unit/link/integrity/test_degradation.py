@@ -25,7 +25,7 @@ KNOWN_TEXTS = [  # every text to a pilot; a new text must be added here
     r"GPS_INPUT stopped: no estimate for 35 s",
     r"estimator (died|stuck|gave up)",
     r"computer is (normal|hot|critical)(, -?\d+ C)?",
-    r"computer (too slow: \d+ of \d+ frames late|keeps up again)",
+    r"computer (too slow: (\d+ of \d+ frames late|running at [\d.]+ of [\d.]+ Hz)|keeps up again)",
     r"telemetry of (two senders, one ignored|one sender again)",
     r"(autopilot rebooted, or its time jumps|the autopilot's time is steady again)",
     r"(attitude jumps without gyros, ignored|the attitude is steady again)",
