@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[3]
 CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
-LINES = {"daemon": 41275, "engines": 1676, "tools": 64610, "tests": 69330}
-WORDS = 65556  # of all documents
+LINES = {"daemon": 41275, "engines": 1676, "tools": 64610, "tests": 69331}
+WORDS = 65550  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 
