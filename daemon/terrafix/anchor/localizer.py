@@ -1,7 +1,7 @@
 """Localization of one frame on the map: correlation, point-mass filter, camera pose, verdict."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -35,7 +35,6 @@ from terrafix.anchor.matching.predicted_view import (
     tilt_sigma_rad,
     view_of,
 )
-from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.relocalization.position_prior import distance_outside_m
 from terrafix.anchor.relocalization.relocalizer import (
@@ -55,7 +54,6 @@ from terrafix.core.initial_position import SEARCH_START_SIGMA_M, START_WINDOW_MA
 from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.node import Image
 from terrafix.map.null_model import FalseAlarmBudget
-from terrafix.map.package import MapPackage
 from terrafix.messages import (
     ON_DRAWN,
     HintVerdict,
@@ -68,7 +66,6 @@ from terrafix.messages import (
     SearchStep,
     Verdict,
 )
-from terrafix_engines.correlation import GraphCorrelator
 
 NEW_GROUND_SHARE = 0.35  # share of the footprint: motion after which an observation counts in full [tuned]
 MIN_OBSERVATION_WEIGHT = 0.08  # weight of another observation of the same ground [tuned]
@@ -93,25 +90,13 @@ class Localizer:
     """State of the localization in one flight. Per frame: ``predict``, ``apply_prior`` if there is one, ``localize``,
     ``label_step``.
 
-    ``ce90_m``: accuracy of map layers that state none; ``store_folder``: folder in memory for computed descriptors;
-    ``places``: place index for the search of a large map; ``correlator``: on a GPU.
+    ``layers``: the map in the local frame of a flight, for its camera; None: there is no map.
     """
 
     def __init__(
-        self,
-        package: MapPackage | None,
-        describer: Describer,
-        ce90_m: float,
-        store_folder: Path | None = None,
-        places: PlaceMemory | None = None,
-        correlator: GraphCorrelator | None = None,
+        self, describer: Describer, layers: Callable[[LocalFrame, CameraCalibration, Describer], MapLayers] | None
     ) -> None:
-        self._package = package
-        self._places = places
-        self._correlator = correlator
-        self._describer = describer
-        self._ce90_m = ce90_m
-        self._store_folder = store_folder
+        self._describer, self._layers_of = describer, layers
         self._layers: MapLayers | None = None
         self._origin: Origin | None = None
         self._ground_m = 0.0
@@ -150,18 +135,9 @@ class Localizer:
         self._open_layers(origin)
 
     def _open_layers(self, origin: Origin) -> None:
-        if self._package is not None:
+        if self._layers_of is not None:
             frame, camera = LocalFrame(origin.lat_deg, origin.lon_deg), CameraCalibration.of(origin.camera)
-            self._layers = MapLayers(
-                self._package,
-                frame,
-                camera,
-                self._describer,
-                self._ce90_m,
-                self._store_folder,
-                self._places,
-                self._correlator,
-            )
+            self._layers = self._layers_of(frame, camera, self._describer)
 
     def replace_describer(self, describer: Describer, agl_m: float) -> None:
         """Continues with another describer. The belief is kept; a running search restarts."""
@@ -387,7 +363,7 @@ class Localizer:
         self._single_frame_budget.spend()
         null, log_probability = layer.null_at(view.agl_m), self._single_frame_budget.log_probability
         place = localize_single_frame(
-            seen.image, view, seen.correlation, belief.modes(MAX_MODES), layer.map, layer.matcher, null, log_probability
+            seen.image, view, seen.correlation, belief.modes(MAX_MODES), layer.matcher, null, log_probability
         )
         if place is None:
             return pose

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -9,6 +10,7 @@ import msgspec
 from terrafix.anchor.initial_position import check_initial_position
 from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.descriptor_cache import Describer
+from terrafix.anchor.matching.map_layers import MapLayers
 from terrafix.anchor.model_monitor import ModelMonitor
 from terrafix.anchor.place_index.recognizer import PlaceMemory
 from terrafix.anchor.thermal_load import ThermalLoad
@@ -67,7 +69,8 @@ class AnchorNode(NodeBase):
         self._describer = describer  # as configured
         self._model = model or ModelMonitor(describer)
         self._load, self._model_suspended = load or ThermalLoad(HealthSection()), False
-        self._localizer = Localizer(package, describer, ce90_m, cache_dir, places, correlator)
+        layers = partial(MapLayers, ce90_m=ce90_m, store_folder=cache_dir, places=places, correlator=correlator)
+        self._localizer = Localizer(describer, None if package is None else partial(layers, package))
         self._correlator = correlator
         self._origin: Origin | None = None
         self._hint: PositionHint | None = None  # not yet applied

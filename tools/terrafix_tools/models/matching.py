@@ -228,9 +228,7 @@ def _place(
     image: Image, view: View, found: CorrelationResult, ground: Ground, matcher: FrameMatcher, modes: list[Mode]
 ) -> np.ndarray | None:
     """East and north of the pose in the mode that the patches choose."""
-    placed = localize_single_frame(
-        image, view, found, modes, ground.source, matcher, ground.null, math.log(FALSE_ALARMS)
-    )
+    placed = localize_single_frame(image, view, found, modes, matcher, ground.null, math.log(FALSE_ALARMS))
     fit = None if placed is None else placed[1].pnp.fit
     return None if fit is None else fit.p_c_in_w_m[:2]
 

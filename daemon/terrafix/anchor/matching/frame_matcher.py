@@ -13,7 +13,7 @@ import numpy as np
 from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
-from terrafix.anchor.matching.orthorectify import Rectified, patch_centres, rectify
+from terrafix.anchor.matching.orthorectify import Rectified, Relief, patch_centres, rays_to, rectify
 from terrafix.anchor.matching.patch_matcher import SearchedMap, match_patches
 from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_SLOPE, BELIEF_LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
@@ -69,6 +69,10 @@ SCALE_STEP = 0.08  # between scale hypotheses, relative [tuned]
 # largest steps of yaw and scale on the coarse cells of a search over the whole map [tuned]
 MAX_YAW_STEP_RAD, MAX_SCALE_STEP = np.radians(13.0), 0.10
 MAX_HYPOTHESES = 81  # number of hypotheses that one frame can afford [tuned]
+# Share of the height: ground whose relief is smaller is projected as a plane; and the largest 1-sigma of a position
+# whose ground the frame is projected on [measured: docs/decisions/070-ground-with-relief.md]
+LEVEL_RELIEF, RELIEF_SIGMA = 0.01, 0.5
+RELIEF_SAMPLES = np.mgrid[-3:4, -3:4].reshape(2, -1).T / 3  # heights from the point below [spec: sevenths of a side]
 MIN_SIDE_CELLS = 24  # smallest side of the orthorectified frame [tuned]
 
 
@@ -84,6 +88,7 @@ class View:
     yaw_sigma_rad: float
     scale_sigma: float  # of the height above ground, relative
     tilt_sigma_rad: float
+    sigma_m: float = math.inf  # of the position, horizontal; 0 where the frame is to be tried
 
 
 class SearchWindow(Protocol):
@@ -218,22 +223,33 @@ class FrameMatcher:
         scales = [1.0 + s for s in _spread(min(1.5 * view.scale_sigma, 0.5), SCALE_TOLERANCE, MAX_SCALE_STEP)]
         return _product(yaws, scales)
 
+    def ground_at(self, points_m: np.ndarray, otherwise_m: float) -> np.ndarray:
+        """(N,) heights AMSL of map points (N, 2), east and north; ``otherwise_m`` where the map knows none."""
+        up_m = self._map.elevation(*points_m.T) if len(points_m) else None
+        known = np.full(len(points_m), np.nan) if up_m is None else up_m
+        return np.where(np.isfinite(known), known, otherwise_m)
+
+    def relief(self, view: View) -> Relief | None:
+        """Of the ground below ``view`` over a plane at ``view.ground_m``. None: it is level, or not known: elsewhere in
+        a wide window the ground is another one."""
+        if not view.sigma_m < RELIEF_SIGMA * view.agl_m:
+            return None
+
+        def above_m(points_m: np.ndarray) -> np.ndarray:
+            return self.ground_at(np.add(points_m, (view.e_m, view.n_m)), view.ground_m) - view.ground_m
+
+        is_level = np.abs(above_m(RELIEF_SAMPLES * view.agl_m)).max() < LEVEL_RELIEF * view.agl_m
+        return None if is_level else above_m
+
     def rectify_all(
         self, image: Image, view: View, hypotheses: Sequence[Hypothesis], gsd_m: float, stride: int
     ) -> list[Rectified | None]:
         """Orthorectified frames, one per hypothesis; None where the camera sees no ground."""
         blurred: dict[float, Image] = {}
+        relief = self.relief(view)
         return [
-            rectify(
-                image,
-                self.camera,
-                local_rotation_up(h.yaw_rad) @ view.r_w_c,
-                view.agl_m * h.scale,
-                gsd_m,
-                stride,
-                blurred,
-            )
-            for h in hypotheses
+            rectify(image, self.camera, turned.r_w_c, turned.agl_m, gsd_m, stride, blurred, relief)
+            for turned in (view_at(view, one, view.e_m, view.n_m) for one in hypotheses)
         ]
 
     def correlate(self, image: Image, view: View, belief: SearchWindow) -> CorrelationResult:
@@ -271,15 +287,12 @@ class FrameMatcher:
         features = self._pooled(learned or self.gradients, pool)
         describer = features.describer
         cell = gsd * describer.stride
-        first = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, describer.stride)
+        cells = gsd, describer.stride
+        (first,) = self.rectify_all(image, view, (AS_PREDICTED,), *cells)
         if first is None or min(first.mask.shape) < describer.stride * MIN_SIDE_CELLS / 2:
             return CorrelationResult(Verdict.TOO_LOW)
         footprint_m = float(np.sqrt(first.mask.sum())) * gsd
-        frames = (
-            [first]
-            if hypotheses == (AS_PREDICTED,)
-            else self.rectify_all(image, view, hypotheses, gsd, describer.stride)
-        )
+        frames = [first] if hypotheses == (AS_PREDICTED,) else self.rectify_all(image, view, hypotheses, *cells)
         usable = [(h, f) for h, f in zip(hypotheses, frames, strict=True) if f is not None]
         extents = [self._extent(f) for _, f in usable]
         e_min = belief.centre[0] - belief.half_m + min(r[0] for r in extents)
@@ -344,7 +357,7 @@ class FrameMatcher:
         gsd = self.cell_m(view.agl_m, FIX_GSD_PER_AGL[describer.name])
         cell = gsd * describer.stride
         image = without_colour(image, describer)
-        frame = rectify(image, self.camera, view.r_w_c, view.agl_m, gsd, describer.stride)
+        (frame,) = self.rectify_all(image, view, (AS_PREDICTED,), gsd, describer.stride)
         if frame is None:
             return None
         radius = max(int(np.ceil(radius_share * view.agl_m / cell)), 3)
@@ -358,11 +371,9 @@ class FrameMatcher:
         searched = SearchedMap(cells, valid, (e_min, n_max))
         centres = patch_centres(self.camera, view.r_w_c, view.agl_m, frame, cell, PATCH_STEP)
         found = match_patches(template, frame, mask, cell, searched, (view.e_m, view.n_m), patch, radius, centres)
-        rays = np.column_stack([found.frame_m, np.full(len(found.frame_m), -view.agl_m)]) @ view.r_w_c
+        rays = rays_to(found.frame_m, view.agl_m, view.r_w_c, self.relief(view))
         xy = rays[:, :2] / rays[:, 2:]
-        up = self._map.elevation(found.map_m[:, 0], found.map_m[:, 1]) if len(xy) else None
-        up = np.full(len(xy), view.ground_m) if up is None else np.where(np.isfinite(up), up, view.ground_m)
-        points = np.column_stack([found.map_m, up])
+        points = np.column_stack([found.map_m, self.ground_at(found.map_m, view.ground_m)])
         given = PnpInput(
             q_w_c=quat_from_rot(view.r_w_c),
             agl_m=view.agl_m,
@@ -410,15 +421,16 @@ def bounded_cells(gsd: float, stride: int, belief: SearchWindow) -> tuple[float,
 
 def view_at(view: View, hypothesis: Hypothesis, e_m: float, n_m: float) -> View:
     r_w_c = local_rotation_up(hypothesis.yaw_rad) @ view.r_w_c
-    return replace(view, e_m=e_m, n_m=n_m, r_w_c=r_w_c, agl_m=view.agl_m * hypothesis.scale)
+    return replace(view, e_m=e_m, n_m=n_m, r_w_c=r_w_c, agl_m=view.agl_m * hypothesis.scale, sigma_m=0.0)
 
 
 def view_of_fix(view: View, fix: PatchFix) -> View:
     """``view`` with the position, rotation and mean height above ground of the pose of ``fix``, which must have one."""
     assert fix.pnp.fit is not None
     p = fix.pnp.fit.p_c_in_w_m
-    agl_m = float(p[2]) - float(fix.points_w_m[:, 2].mean())
-    return replace(view, e_m=float(p[0]), n_m=float(p[1]), r_w_c=fix.pnp.fit.r_w_c, agl_m=agl_m)
+    ground_m = float(fix.points_w_m[:, 2].mean())
+    there = replace(view, r_w_c=fix.pnp.fit.r_w_c, agl_m=float(p[2]) - ground_m, ground_m=ground_m)
+    return view_at(there, AS_PREDICTED, float(p[0]), float(p[1]))
 
 
 def levelled_view(view: View, fix: PatchFix) -> View:

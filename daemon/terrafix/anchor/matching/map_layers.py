@@ -69,9 +69,8 @@ class MapLayers:
             recognizer = None
             if places is not None and (indexed := places.index.layer(package.manifest.checksum, layer.table)):
                 recognizer = PlaceRecognizer(places, indexed, frame)
-            consensus = ConsensusPose(bound, matcher)
             self._all[layer.table] = MapLayer(
-                bound, matcher, consensus, sigma_m, layer.null_model, recognizer, layer.is_drawn
+                bound, matcher, ConsensusPose(matcher), sigma_m, layer.null_model, recognizer, layer.is_drawn
             )
         self._selector = LayerSelector([layer.table for layer in layers], DRAWN_TABLE)
 

@@ -1,6 +1,7 @@
 """Orthorectification of the frame: north-up at a chosen ground sampling distance, from attitude and height above ground
 (PB-6)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -18,6 +19,10 @@ MIN_AXIS_DOWN = 0.3
 # interpolated, to a twentieth of a rectified pixel for a k1 of -0.2. [measured: test_orthorectify]
 LENS_STEP_PX = 4
 OUTSIDE_PX = -1e6  # of ground behind the camera, so that no interpolated pixel is inside [spec: any far pixel]
+
+# Metres (N,) by which the ground rises above the plane of projection, at points (N, 2), east and north [m] of the one
+# below the camera.
+Relief = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -54,10 +59,11 @@ def rectify(
     gsd_m: float,
     stride: int = 1,
     blurred: dict[float, Image] | None = None,
+    relief: Relief | None = None,
 ) -> Rectified | None:
-    """Projects ``image``, in colour or grey, on flat ground ``agl_m`` below the camera. Sides are multiples of
-    ``stride`` pixels. ``blurred``: cache of blurred copies of the image by scale factor, shared between yaw hypotheses.
-    None: no ground is visible."""
+    """Projects ``image``, in colour or grey, on the ground: ``relief`` over a plane ``agl_m`` below the camera, or that
+    plane. Sides are multiples of ``stride`` pixels. ``blurred``: cache of blurred copies of the image by scale factor,
+    shared between yaw hypotheses. None: no ground is visible."""
     box = footprint(camera, r_w_c, agl_m)
     if box is None:
         return None
@@ -66,7 +72,6 @@ def rectify(
     width = int(np.ceil((e_max - e_min) / cell)) * stride
     height = int(np.ceil((n_max - n_min) / cell)) * stride
     ground = np.array([[gsd_m, 0.0, e_min + 0.5 * gsd_m], [0.0, -gsd_m, n_max - 0.5 * gsd_m], [0.0, 0.0, -agl_m]])
-    to_camera = r_w_c.T @ ground  # rectified pixel (x, y, 1) -> ray in the camera
     shrink = gsd_m / (agl_m / camera.fx)
     source = image
     if shrink > 1.4:  # anti-aliasing
@@ -74,12 +79,12 @@ def rectify(
         if shrink not in blurred:
             blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
         source = blurred[shrink]
-    if camera.distortion or camera.radial_k1 or camera.readout is not None:
-        px = _lens_map(camera, to_camera, width, height)
+    if camera.distortion or camera.radial_k1 or camera.readout is not None or relief is not None:
+        px = _lens_map(camera, r_w_c, ground, (height, width), relief)
         flat = cv2.remap(source, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
         mask = (px >= 0).all(-1) & (px[..., 0] <= camera.width - 1) & (px[..., 1] <= camera.height - 1)
     else:
-        matrix = camera.matrix() @ to_camera
+        matrix = camera.matrix() @ (r_w_c.T @ ground)
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         flat = cv2.warpPerspective(source, matrix, (width, height), flags=how)
         white = np.full(image.shape[:2], 255, np.uint8)
@@ -103,15 +108,27 @@ def patch_centres(
     return np.column_stack([frame.n_max_m - ground_m[:, 1], ground_m[:, 0] - frame.e_min_m]) / cell_m
 
 
-def _lens_map(camera: CameraCalibration, to_camera: np.ndarray, width: int, height: int) -> np.ndarray:
+def rays_to(ground_m: np.ndarray, agl_m: float, r_w_c: np.ndarray, relief: Relief | None) -> np.ndarray:
+    """(N, 3) in the camera's axes: rays to the points ``ground_m`` (N, 2) of a rectified frame, east and north of the
+    one below the camera; ``relief`` as in ``rectify``."""
+    up_m = np.full(len(ground_m), -agl_m)
+    return np.asarray(np.column_stack([ground_m, up_m if relief is None else up_m + relief(ground_m)]) @ r_w_c)
+
+
+def _lens_map(
+    camera: CameraCalibration, r_w_c: np.ndarray, ground: np.ndarray, sides: tuple[int, int], relief: Relief | None
+) -> np.ndarray:
     """(height, width, 2) float32: pixel of the frame at each rectified pixel, far outside of it for ground behind the
-    camera. ``to_camera`` (3, 3): rectified pixel (x, y, 1) -> ray in the camera."""
-    columns, rows = (side // LENS_STEP_PX + 2 for side in (width, height))
+    camera. ``ground`` (3, 3): rectified pixel (x, y, 1) -> point of the plane; ``sides``: height and width."""
+    rows, columns = (side // LENS_STEP_PX + 2 for side in sides)
     x, y = np.meshgrid(np.arange(columns) * float(LENS_STEP_PX), np.arange(rows) * float(LENS_STEP_PX))
-    rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ to_camera.T
+    pixels = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    rays = pixels @ (r_w_c.T @ ground).T
+    if relief is not None:
+        rays += relief(pixels @ ground[:2].T)[:, None] * r_w_c[2]
     behind = rays[:, 2] <= 0
     rays[behind] = (0.0, 0.0, 1.0)
     px = camera.project(rays)
     px[behind] = OUTSIDE_PX
     coarse = px.reshape(rows, columns, 2).astype(np.float32)
-    return interpolated(coarse, LENS_STEP_PX, height, width)
+    return interpolated(coarse, LENS_STEP_PX, *sides)

@@ -42,6 +42,7 @@ def view_of(prediction: Prediction, ground: GroundPlane | None, ground_m: float)
         float(np.sqrt(prediction.cov[VAR_YAW])),
         prediction.agl_sigma_m / max(agl_m, 1.0),
         tilt_sigma_rad(prediction),
+        np.inf if ground is None else position_sigma_m(prediction),
     )
 
 

@@ -99,7 +99,7 @@ class MapSearch:
         self._max_blocks = 0  # number of blocks that one joint correlation can afford
         self._null = null
         self._budget = budget
-        self.tracker = HypothesisTracker(source, matcher, null.patches)
+        self.tracker = HypothesisTracker(matcher, null.patches)
         self.proposed: list[ProposedPlace] = []  # best places of the last joint correlation, best first
         self._p_m = np.zeros(2)  # position by odometry since the search began
         self._var_m2 = 0.0

@@ -14,12 +14,11 @@ from terrafix.anchor.verification.hypothesis_tracker import TRACK_LLR_MAX, evide
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import PLACE_CELL_PER_AGL, PlaceVerifier
 from terrafix.core.node import Image
-from terrafix.map.package import LocalMap
 
 
 class ConsensusPose:
-    def __init__(self, source: LocalMap, matcher: FrameMatcher) -> None:
-        self._verifier = PlaceVerifier(source, matcher)
+    def __init__(self, matcher: FrameMatcher) -> None:
+        self._verifier = PlaceVerifier(matcher)
 
     def estimate(self, image: Image, view: View) -> PatchFix | None:
         """``view``: believed position, yaw and height above ground. None: the evidence is below the largest that one

@@ -9,13 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, PatchFix, View
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, PatchFix, View, view_at
 from terrafix.anchor.verification.patch_consensus import PATCH_SCALE_SIGMA, YAW_SIGMA_RAD
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import FINE_PLACE_CELL_PER_AGL, PLACE_CELL_PER_AGL, PlaceVerifier
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.node import Image
-from terrafix.map.package import LocalMap
 
 MAX_CHECKS_PER_FRAME = 8  # tracks that one frame is compared with, the most likely first; about 50 ms each [tuned]
 # share of the height: places closer than this are neighbours and count as one in the joint correlation [tuned]
@@ -127,11 +126,10 @@ class AcceptedPlace:
 
 
 class HypothesisTracker:
-    def __init__(self, source: LocalMap, matcher: FrameMatcher, patches: tuple[float, float] = (0.0, 1.0)) -> None:
+    def __init__(self, matcher: FrameMatcher, patches: tuple[float, float] = (0.0, 1.0)) -> None:
         """``patches``: mean and standard deviation of the map's null model for patches."""
-        self._map = source
         self._matcher = matcher
-        self.verifier = PlaceVerifier(source, matcher)
+        self.verifier = PlaceVerifier(matcher)
         self.null = PatchNull(patches)
         self.tracks: list[PlaceHypothesis] = []  # best first
         # standard deviations above the null model, for the tracks compared with the last frame
@@ -177,15 +175,8 @@ class HypothesisTracker:
         return None if fix is None else AcceptedPlace(self.tracks[0], self._matcher.refine_fix(image, view, fix))
 
     def _view_at(self, track: PlaceHypothesis, view: View) -> View:
-        up = self._map.elevation(np.array([track.e_m]), np.array([track.n_m]))
-        return replace(
-            view,
-            e_m=track.e_m,
-            n_m=track.n_m,
-            r_w_c=local_rotation_up(track.hypothesis.yaw_rad) @ view.r_w_c,
-            agl_m=view.agl_m * track.hypothesis.scale,
-            ground_m=view.ground_m if up is None or not np.isfinite(up[0]) else float(up[0]),
-        )
+        ground_m = float(self._matcher.ground_at(np.array([[track.e_m, track.n_m]]), view.ground_m)[0])
+        return replace(view_at(view, track.hypothesis, track.e_m, track.n_m), ground_m=ground_m)
 
     def _update_track(self, track: PlaceHypothesis, image: Image, view: View, path_m: float) -> PatchFix | None:
         """Updates a track with the frame and moves it to the position that fits best. None: no evidence, or no pose."""

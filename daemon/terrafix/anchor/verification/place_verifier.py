@@ -15,14 +15,13 @@ from terrafix.anchor.matching.frame_matcher import (
     view_of_fix,
     without_colour,
 )
-from terrafix.anchor.matching.orthorectify import patch_centres, rectify
+from terrafix.anchor.matching.orthorectify import patch_centres, rays_to, rectify
 from terrafix.anchor.matching.patch_matcher import correlate_patches
 from terrafix.anchor.verification.patch_consensus import MAX_LLR, PatchConsensus, estimate_consensus
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 from terrafix.core.pnp import PNP_MIN_INLIERS, SEARCH_RADIUS, PnpResult
 from terrafix.core.pose import fit_pose
-from terrafix.map.package import LocalMap
 from terrafix.messages import Verdict
 
 # Cell size as a share of the height, coarse and fine. Fine cells separate right places from the null model better (by a
@@ -46,8 +45,7 @@ class VerifiedPlace:
 
 
 class PlaceVerifier:
-    def __init__(self, source: LocalMap, matcher: FrameMatcher) -> None:
-        self._map = source
+    def __init__(self, matcher: FrameMatcher) -> None:
         self._matcher = matcher
         self._image: Image | None = None
         self._reduced_frame: tuple[Image, CameraCalibration] | None = None
@@ -65,7 +63,8 @@ class PlaceVerifier:
         tilt of the view. None: too few patches lie on the map."""
         cell_m = self._matcher.cell_m(view.agl_m, cell_per_agl)
         reduced, camera = self._reduced(image, view.agl_m)
-        frame = rectify(reduced, camera, view.r_w_c, view.agl_m, cell_m)
+        relief = self._matcher.relief(view)
+        frame = rectify(reduced, camera, view.r_w_c, view.agl_m, cell_m, relief=relief)
         if frame is None:
             return None
         radius, patch = round(radius_per_agl * view.agl_m / cell_m), round(PATCH_PER_AGL * view.agl_m / cell_m)
@@ -95,7 +94,8 @@ class PlaceVerifier:
         )
         tilt_sigma_rad = view.tilt_sigma_rad if tilt_prior else None
         found_m = on_map_m + found.offsets * view.agl_m
-        return VerifiedPlace(found, self._pose(view, ground_m, found_m, found, cell_m, tilt_sigma_rad))
+        rays = rays_to(ground_m, view.agl_m, view.r_w_c, relief)
+        return VerifiedPlace(found, self._pose(view, rays, found_m, found, cell_m, tilt_sigma_rad))
 
     def refine(self, image: Image, view: View, first: PatchFix) -> PatchFix | None:
         """The pose ``first``, computed from ``view``, refined on the cells of a fix and without a tilt prior: the
@@ -118,18 +118,16 @@ class PlaceVerifier:
     def _pose(
         self,
         view: View,
-        ground_m: np.ndarray,
+        rays: np.ndarray,
         map_m: np.ndarray,
         found: PatchConsensus,
         cell_m: float,
         tilt_sigma_rad: float | None,
     ) -> PatchFix:
-        rays = np.column_stack([ground_m, np.full(len(ground_m), -view.agl_m)]) @ view.r_w_c
         xy = rays[:, :2] / rays[:, 2:]
-        up = self._map.elevation(map_m[:, 0], map_m[:, 1])
-        up = np.full(len(xy), view.ground_m) if up is None else np.where(np.isfinite(up), up, view.ground_m)
+        points = np.column_stack([map_m, self._matcher.ground_at(map_m, view.ground_m)])
         # By its evidence, so that none comes or goes by a step.
-        points, weights = np.column_stack([map_m, up]), np.clip(found.values / MAX_LLR, 0.0, 1.0)
+        weights = np.clip(found.values / MAX_LLR, 0.0, 1.0)
         start = np.array([view.e_m, view.n_m, view.ground_m + view.agl_m])
         fit = None
         if found.inliers.sum() >= PNP_MIN_INLIERS:

@@ -23,7 +23,6 @@ from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import PLACE_CELL_PER_AGL, PlaceVerifier
 from terrafix.core.node import Image
 from terrafix.map.null_model import NullRow
-from terrafix.map.package import LocalMap
 
 MAX_MODES = 12  # modes that are verified, about 50 ms each [tuned]
 LIKELIHOOD_RATIO = float(np.exp(TRACK_LLR_MAX))  # factor on the mass of the accepted mode [spec: exp(TRACK_LLR_MAX)]
@@ -34,7 +33,6 @@ def localize_single_frame(
     view: View,
     correlation: CorrelationResult,
     modes: Sequence[Mode],
-    source: LocalMap,
     matcher: FrameMatcher,
     null: NullRow,
     log_probability: float,
@@ -42,7 +40,7 @@ def localize_single_frame(
     """``modes``: of the belief after this frame's correlation. ``null``: null model of the map at this height;
     ``log_probability``: allowed false-alarm probability of this frame. -> the accepted mode with its pose; None: no
     place, or more than one."""
-    verifier, patch_null = PlaceVerifier(source, matcher), PatchNull(null.patches)
+    verifier, patch_null = PlaceVerifier(matcher), PatchNull(null.patches)
     views = [view_at(view, correlation.best_at(m.e_m, m.n_m)[0], m.e_m, m.n_m) for m in modes]
     verified = [
         (verifier.verify(image, place_view, PLACE_CELL_PER_AGL), mode)

@@ -80,6 +80,7 @@ class Monitors:
         self._textured: int | None = None  # the newest frame with accepted odometry
         self._orientation: Orientation | None = None
         self._reported: dict[str, Finding] = {}
+        self._rise_m = 0.0  # of the ground below over that at the start, by the DEM
 
     @property
     def sigma_m(self) -> float:
@@ -134,7 +135,7 @@ class Monitors:
         mounted = (motion, *(visual_motion(pairs, before, now, r_b_c) for r_b_c in self._other_mounts))
         displacements = [complex(*one.displacement) for one in mounted if one is not None]
         if len(displacements) == len(mounted):
-            velocities = np.array(displacements) * now.agl_m / ((odometry.t_ns - keyframe_ns) * 1e-9)
+            velocities = np.array(displacements) * (now.agl_m - self._rise_m) / ((odometry.t_ns - keyframe_ns) * 1e-9)
             self._add_velocity(velocities, (keyframe_ns + odometry.t_ns) // 2, telemetry)
 
     def _add_velocity(self, visual_mps: np.ndarray, t_ns: int, telemetry: Telemetry) -> None:
@@ -150,6 +151,8 @@ class Monitors:
     def on_map_match(self, match: MapMatch, telemetry: Telemetry, *, accepted: bool) -> None:
         """``accepted``: the match has entered the graph. Rejected poses are used as well, because one whose height is
         off is rarely accepted."""
+        if match.ground is not None and self._origin.ground_amsl_m is not None:
+            self._rise_m = match.ground.amsl_m - self._origin.ground_amsl_m
         pose = match.verdict is Verdict.ACCEPTED and not match.position_only
         found = accepted and pose
         # A coarse fix in the graph counts neither as found nor as nothing found. 15 % of the correlations of correct

@@ -14,7 +14,6 @@ from terrafix.anchor.matching.frame_matcher import (
     CorrelationResult,
     FrameMatcher,
     Hypothesis,
-    PatchFix,
     View,
     hypotheses_of,
 )
@@ -183,37 +182,50 @@ class PartlyKnownDem(SlopedMap):
         return np.where(e_m < TRUE_M[0], np.nan, super().elevation(e_m, n_m))
 
 
-def fix_over_slope(ground: np.ndarray, world: SlopedMap) -> tuple[PatchFix, View, np.ndarray]:
-    """The fix with a plane through the ground below the camera as the prediction, that prediction, and the true
-    position (3,), AGL_M above the slope."""
-    below_m = float(np.dot(SLOPE, TRUE_M[:2]))
-    image = view(ground, PINHOLE, TRUE_R, np.array([*TRUE_M[:2], below_m + AGL_M]), SLOPE)
-    believed = replace(predicted_view(*TRUE_M[:2].tolist()), ground_m=AMSL_M + below_m)
+def over_slope(
+    ground: np.ndarray, world: SlopedMap, slope: tuple[float, float] = SLOPE, r: np.ndarray = TRUE_R
+) -> tuple[FrameMatcher, np.ndarray, View, np.ndarray]:
+    """The matcher, a view of the slope from AGL_M above it, a plane through the ground below the camera as the
+    prediction, and the true position (3,)."""
+    below_m = float(np.dot(slope, TRUE_M[:2]))
+    image = view(ground, PINHOLE, r, np.array([*TRUE_M[:2], below_m + AGL_M]), slope)
+    believed = replace(predicted_view(*TRUE_M[:2].tolist(), r=r), ground_m=AMSL_M + below_m, sigma_m=10.0)
     matcher = FrameMatcher(PINHOLE, world, GradientDescriber())  # type: ignore[arg-type]
-    fix = matcher.fix(image, believed, Hypothesis(0.0, 1.0), *TRUE_M[:2].tolist())
+    return matcher, image, believed, np.array([*TRUE_M[:2], AMSL_M + below_m + AGL_M])
+
+
+IN_A_TURN, STEEP = rotation(40.0, 2.0, 40.0), (0.2, -0.1)
+
+
+@pytest.mark.parametrize(("slope", "r"), [(SLOPE, TRUE_R), (STEEP, IN_A_TURN)])
+def test_the_matched_map_points_have_the_heights_of_the_dem(
+    ground: np.ndarray, slope: tuple[float, float], r: np.ndarray
+) -> None:
+    """Taken for a plane, a slope of 6 % would tilt the pose by three degrees. In a turn 20 of 48 patches would match a
+    frame that is projected on a plane, and its best place would be 3 m off."""
+    matcher, image, believed, true_m = over_slope(ground, SlopedMap(ground, slope, AMSL_M), slope, r)
+    belief = Belief(believed.e_m, believed.n_m, 20.0, CELL_M)
+    belief.update(matcher.correlate(image, believed, belief).surfaces, 1.0)
+    assert np.hypot(*(np.array([belief.mode().e_m, belief.mode().n_m]) - true_m[:2])) < 1.0
+    fix = matcher.fix(image, believed, Hypothesis(0.0, 1.0), believed.e_m, believed.n_m)
     assert fix is not None and fix.pnp.verdict is Verdict.ACCEPTED
-    return fix, believed, np.array([*TRUE_M[:2], AMSL_M + below_m + AGL_M])
-
-
-def test_the_matched_map_points_have_the_heights_of_the_dem(ground: np.ndarray) -> None:
-    """Taken for a plane, a slope of 6 % would tilt the pose by three degrees."""
-    world = SlopedMap(ground, SLOPE, AMSL_M)
-    fix, believed, true_m = fix_over_slope(ground, world)
     e_m, n_m, up_m = fix.points_w_m.T
-    assert up_m == pytest.approx(AMSL_M + SLOPE[0] * e_m + SLOPE[1] * n_m)
+    assert up_m == pytest.approx(AMSL_M + slope[0] * e_m + slope[1] * n_m)
     assert np.ptp(up_m) > 4.0
     assert fix.pnp.fit is not None
-    assert np.linalg.norm(fix.pnp.fit.p_c_in_w_m - true_m) < 1.5
-    assert np.degrees(np.linalg.norm(log_so3(TRUE_R.T @ fix.pnp.fit.r_w_c))) < 0.6
+    assert np.linalg.norm(fix.pnp.fit.p_c_in_w_m - true_m) < 0.5
+    assert np.degrees(np.linalg.norm(log_so3(r.T @ fix.pnp.fit.r_w_c))) < 0.6
     place = MatchPlace(e_m=float(TRUE_M[0]), n_m=float(TRUE_M[1]), mass=1.0)
     empty = MapMatch(t_ns=0, frame_id=0, verdict=Verdict.ACCEPTED, matcher="gradient", place=place)
     published = np.array(pose_match(empty, fix, believed).matches)
-    assert len(published) == fix.pnp.inliers.sum() >= 8
-    assert published[:, 4] == pytest.approx(AMSL_M + published[:, 2:4] @ SLOPE)
+    assert len(published) == fix.pnp.inliers.sum() > 40
+    assert published[:, 4] == pytest.approx(AMSL_M + published[:, 2:4] @ slope)
 
 
 def test_where_the_dem_is_unknown_matched_map_points_have_the_predicted_ground_height(ground: np.ndarray) -> None:
-    fix, believed, _ = fix_over_slope(ground, PartlyKnownDem(ground, SLOPE, AMSL_M))
+    matcher, image, believed, _ = over_slope(ground, PartlyKnownDem(ground, SLOPE, AMSL_M))
+    fix = matcher.fix(image, believed, Hypothesis(0.0, 1.0), believed.e_m, believed.n_m)
+    assert fix is not None
     e_m, n_m, up_m = fix.points_w_m.T
     unknown = e_m < TRUE_M[0]
     assert 3 <= unknown.sum() <= len(e_m) - 3
@@ -305,14 +317,6 @@ def test_nearly_equal_scores_give_no_precise_scale_measurement() -> None:
 def test_the_best_scale_at_the_end_of_the_grid_gives_no_measurement() -> None:
     assert scales_scored(small=3.0, same=4.0, large=5.0).scale_at(0.0, 0.0) is None
     assert scales_scored(small=5.0, same=4.0, large=3.0).scale_at(0.0, 0.0) is None
-
-
-def test_the_correlation_is_deterministic(matcher: FrameMatcher, frame: np.ndarray) -> None:
-    results = [
-        matcher.correlate(frame, predicted_view(yaw_sigma_deg=8.0), Belief(0.0, 0.0, 25.0, CELL_M)) for _ in range(2)
-    ]
-    for a, b in zip(results[0].surfaces, results[1].surfaces, strict=True):
-        assert np.array_equal(a.z, b.z, equal_nan=True)
 
 
 def test_of_many_hypotheses_the_best_are_correlated_on_fine_cells_and_find_the_place(

@@ -12,6 +12,7 @@ from textured_ground import LENS, PINHOLE, FlatMap, rotation, texture, view
 
 GSD_M = 0.5
 ATTITUDES = [(0.0, 0.0, 0.0), (137.0, 0.0, 0.0), (20.0, 12.0, -9.0), (-75.0, -6.0, 15.0)]
+IN_A_TURN, SLOPE, LEVEL = (50.0, 3.0, 40.0), (0.2, -0.1), (0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -21,15 +22,21 @@ def ground() -> np.ndarray:
 
 @pytest.mark.parametrize("rolling", [False, True])
 @pytest.mark.parametrize("camera", [PINHOLE, LENS])
-@pytest.mark.parametrize("attitude", ATTITUDES)
+@pytest.mark.parametrize(("attitude", "slope"), [*((one, LEVEL) for one in ATTITUDES), (IN_A_TURN, SLOPE)])
 def test_the_orthorectified_frame_is_aligned_with_the_map(
-    ground: np.ndarray, camera: CameraCalibration, attitude: tuple[float, ...], rolling: bool
+    ground: np.ndarray,
+    camera: CameraCalibration,
+    attitude: tuple[float, ...],
+    slope: tuple[float, float],
+    rolling: bool,
 ) -> None:
     r, p = rotation(*attitude), np.array([14.3, -22.7, 90.0])
+    relief = None if slope == LEVEL else lambda points_m: points_m @ slope
+    above_m = np.array([0.0, 0.0, np.dot(slope, p[:2])])
     if rolling:
         moved = np.array([0.4, 0.3, -0.5]), r.T @ np.array([15.0, 5.0, 0.0]) / 90.0
         camera = replace(camera, readout=Readout(0.05 / 359, 179.5, *moved, -r[2]))
-    flat = rectify(view(ground, camera, r, p), camera, r, 90.0, GSD_M)
+    flat = rectify(view(ground, camera, r, p + above_m, slope), camera, r, 90.0, GSD_M, relief=relief)
     assert flat is not None
     h, w = flat.mask.shape
     shown, valid = FlatMap(ground).window(p[0] + flat.e_min_m, p[1] + flat.n_max_m, w, h, GSD_M)

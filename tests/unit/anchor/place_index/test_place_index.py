@@ -184,11 +184,14 @@ def test_the_index_of_the_configuration_is_opened_with_its_descriptor(folder: Pa
         PlaceMemory.open(Places(index=str(unknown)), str(tmp_path), verify=True)
 
 
-def test_a_broken_index_stops_the_start_but_not_a_restart_in_flight(folder: Path, tmp_path: Path) -> None:
-    def started(index: Path, epoch_ns: int | None) -> PlaceMemory | None:
+def test_a_broken_index_stops_the_start_but_not_a_restart_in_flight(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("terrafix.anchor.node.AnchorNode", lambda *given: given[-2])
+
+    def started(index: Path, epoch_ns: int | None) -> object:
         config = msgspec.structs.replace(load([]), places=Places(index=str(index)))
-        node = make_node(NodeContext(config, MemoryFrameStore(2), None, tmp_path, epoch_ns=epoch_ns))
-        return node._localizer._places
+        return make_node(NodeContext(config, MemoryFrameStore(2), None, tmp_path, epoch_ns=epoch_ns))
 
     broken = changed(folder, tmp_path / "broken", version=0)
     with pytest.raises(MapError, match="version 0"):

@@ -40,7 +40,7 @@ PROPOSED_VIEW = View(
 @pytest.fixture(scope="module")
 def verifier() -> PlaceVerifier:
     source = FlatMap(texture(8, 400.0))
-    return PlaceVerifier(source, FrameMatcher(PINHOLE, source, GradientDescriber()))  # type: ignore[arg-type]
+    return PlaceVerifier(FrameMatcher(PINHOLE, source, GradientDescriber()))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

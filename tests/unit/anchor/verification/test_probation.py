@@ -42,9 +42,7 @@ HERE = View(float(TRUE_M[0]), float(TRUE_M[1]), R, AGL_M, 0.0, 0.03, 0.02, 0.02)
 
 def probation(ground: np.ndarray) -> Probation:
     source: Any = SingleMapPackage(ground)
-    return Probation(
-        HypothesisTracker(source, FrameMatcher(PINHOLE, source, GradientDescriber())), DEFAULT_NULL.frame, AGL_M
-    )
+    return Probation(HypothesisTracker(FrameMatcher(PINHOLE, source, GradientDescriber())), DEFAULT_NULL.frame, AGL_M)
 
 
 def test_under_the_null_model_the_mean_odds_factor_is_below_one() -> None:
@@ -97,7 +95,7 @@ def test_the_same_ground_gives_no_evidence(ground: np.ndarray) -> None:
 @pytest.mark.slow
 def test_a_place_without_evidence_fails_after_some_stretches_of_ground(ground: np.ndarray) -> None:
     source: Any = SingleMapPackage(ground)
-    tracks = HypothesisTracker(source, FrameMatcher(PINHOLE, source, GradientDescriber()))
+    tracks = HypothesisTracker(FrameMatcher(PINHOLE, source, GradientDescriber()))
     other = texture(21, SIDE_M)
     images = [
         view(other, PINHOLE, R, np.array([e_m, n_m, AGL_M]))

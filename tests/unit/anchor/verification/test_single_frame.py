@@ -39,7 +39,7 @@ def selected_mode(
     matcher = FrameMatcher(PINHOLE, source, GradientDescriber())
     predicted = View(0.0, 0.0, R, AGL_M, 0.0, 0.03, 0.02, 0.03)
     found = localize_single_frame(
-        frame, predicted, SameResult(Verdict.ACCEPTED), modes, source, matcher, DEFAULT_NULL, log_probability
+        frame, predicted, SameResult(Verdict.ACCEPTED), modes, matcher, DEFAULT_NULL, log_probability
     )
     if found is None:
         return None

@@ -381,6 +381,23 @@ def test_correlations_count_over_ground_with_texture_alone(verdict: Verdict, cou
     assert [fault.quantity for fault in monitors.take_changes(t_ns(30))] == (["registration"] if counts else [])
 
 
+def test_velocities_by_the_images_are_by_the_height_above_the_ground_below(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above ground that lies 80 m over that at the start, the reported height is 80 m more."""
+    seen: dict[float, list[np.ndarray]] = {0.0: [], 80.0: []}
+    for rise_m, velocities in seen.items():
+        monkeypatch.setattr(InertialMonitor, "add", lambda *of, to=velocities: to.append(of[-1]))
+        origin = msgspec.structs.replace(ORIGIN, ground_amsl_m=(ORIGIN.ground_amsl_m or 0.0) - rise_m)
+        monitors, telemetry, flight = Monitors(origin), Telemetry(), Flight(20, fix_every=1, dem=True)
+        for i in range(20):
+            state, odometry, match = flight.messages(i)
+            assert isinstance(state, VehicleState) and state.agl_m is not None
+            assert isinstance(odometry, Odometry) and isinstance(match, MapMatch)
+            telemetry.add(msgspec.structs.replace(state, agl_m=state.agl_m + rise_m))
+            monitors.on_odometry(odometry, telemetry, 10.0, HEIGHT_M)
+            monitors.on_map_match(match, telemetry, accepted=True)
+    assert len(seen[0.0]) > 5 and np.array(seen[80.0]) == pytest.approx(np.array(seen[0.0]))
+
+
 @pytest.mark.slow
 def test_correlations_with_a_drawn_map_do_not_count_against_registration() -> None:
     assert _fly(partial(_unmatched, matcher=f"gradient{ON_DRAWN}"), fix_every=1)[1] == []
