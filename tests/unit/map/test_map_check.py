@@ -213,6 +213,5 @@ def test_real_water_is_not_matchable_and_a_real_town_is(tmp_path: Path, data_set
     assert {at(x, 0.50) for x in (0.74, 0.78)} == {Sight.SEES}  # bushes and houses ashore
     reef.close()
     town = MapPackage.open(build(data_set("maps/town.tif"), tmp_path / "town.gpkg"))
-    report = check(town, agl_m=120.0).report
-    assert report.sees > 0.95
+    assert check(town, agl_m=120.0).report.sees > 0.95
     town.close()

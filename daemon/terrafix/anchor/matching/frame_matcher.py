@@ -56,7 +56,7 @@ PATCH_STEP = PATCH_PER_AGL / 2  # between patches, normalised [spec: they overla
 MIN_PATCH_CELLS = 8  # smallest side of a patch, cells [tuned]
 # Fewest inliers of a pose on learned descriptors. A cell of a learned model has a receptive field of a hundred pixels,
 # so that errors of neighbours are correlated. With 14 inliers required, 5 of 560 frames from other places had a pose;
-# with 20, none of 640. At right places 15 to 48 patches agree. [measured: docs/models.md]
+# with 20, none of 640. At right places 15 to 48 patches agree. [measured: this comment]
 LEARNED_INLIERS = 20
 # search radius and inlier threshold of the first pass while the tilt is not known, shares of the height [tuned]
 FIRST_SEARCH_RADIUS, FIRST_THRESHOLD = 0.2, 0.05
