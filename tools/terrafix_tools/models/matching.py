@@ -169,7 +169,7 @@ def ground_of(one: MatchSet, folder: Path, places: int) -> Ground:
                 r_w_c=local_rotation_up(yaw_rad) @ true.predicted.r_w_c,
                 yaw_sigma_rad=YAW_SIGMA_RAD,
             )
-            frames.append(Frame(true.frame, predicted, NEAR_M))
+            frames.append(Frame(true.frame, predicted, max(NEAR_M, belief_cell_m(one.agl_m, source.gsd_m))))
         return Ground(source, CAMERA, frames)
     return _flight(folder / one.flight, one.every, places)
 
