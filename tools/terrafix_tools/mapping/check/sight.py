@@ -10,6 +10,7 @@ houses, a harvest, snow) differs from place to place; how far the shares hold: d
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -18,6 +19,7 @@ import numpy as np
 
 from terrafix.anchor.localizer import Localizer
 from terrafix.anchor.matching.frame_matcher import FrameMatcher
+from terrafix.anchor.matching.map_layers import MapLayers
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.config import Map
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
@@ -91,7 +93,8 @@ class MatchabilityProbe:
         seen = self._camera = lens.scaled(min(MAX_FRAME_PX / max(lens.width, lens.height), 1.0))
         cell_m = FrameMatcher(seen, local, GradientDescriber()).correlation_cell_m(agl_m)
         self._noise_sigma_px = cell_m * seen.fx / agl_m
-        self._localizer = Localizer(cast(Any, _OneLayer(local, layer)), GradientDescriber(), Map().ce90_m)
+        layers = partial(MapLayers, cast(Any, _OneLayer(local, layer)), ce90_m=Map().ce90_m)
+        self._localizer = Localizer(GradientDescriber(), layers)
         self._localizer.begin_flight(
             Origin(
                 t_ns=0,
