@@ -10,9 +10,8 @@ houses, a harvest, snow) differs from place to place; how far the shares hold: d
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import partial
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -93,8 +92,8 @@ class MatchabilityProbe:
         seen = self._camera = lens.scaled(min(MAX_FRAME_PX / max(lens.width, lens.height), 1.0))
         cell_m = FrameMatcher(seen, local, GradientDescriber()).correlation_cell_m(agl_m)
         self._noise_sigma_px = cell_m * seen.fx / agl_m
-        layers = partial(MapLayers, cast(Any, _OneLayer(local, layer)), ce90_m=Map().ce90_m)
-        self._localizer = Localizer(GradientDescriber(), layers)
+        package: Any = _OneLayer(local, layer)
+        self._localizer = Localizer(GradientDescriber(), lambda a, b, c: MapLayers(package, a, b, c, Map().ce90_m))
         self._localizer.begin_flight(
             Origin(
                 t_ns=0,
