@@ -201,6 +201,14 @@ def test_before_the_first_fix_there_is_no_age() -> None:
     assert sigma_m(run.estimate(3)) > ORIGIN.start_sigma_m * 0.9
 
 
+def test_two_runs_publish_the_same() -> None:
+    flight = Flight(40, seed=5)
+    runs = [EstimatorRun() for _ in range(2)]
+    for run in runs:
+        run.feed(flight.all_messages())
+    assert msgspec.json.encode(runs[0].published) == msgspec.json.encode(runs[1].published)
+
+
 # --- seeing nothing ----------------------------------------------------------------------------------------
 
 

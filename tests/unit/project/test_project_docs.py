@@ -137,6 +137,12 @@ def test_the_page_of_inputs_has_the_generated_tables_and_every_row_names_tests_t
             assert f"def {name}(" in source, f"{row.quantity}: {file} has no {name}"
 
 
+def test_files_named_on_the_architecture_page_exist() -> None:
+    text = project_tables.PAGE.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:\w+/)+\w+\.py)`", text):
+        assert any((ROOT / folder / name).is_file() for folder in ("daemon/terrafix", "engines", "tools")), name
+
+
 def test_functions_named_beside_files_on_the_architecture_page_exist() -> None:
     text = project_tables.PAGE.read_text(encoding="utf-8")
     pairs = re.findall(r"`((?:\w+/)+\w+\.py)`: `(\w+)`(?: \([^)]*\))?(?:, `(\w+)`)?", text)

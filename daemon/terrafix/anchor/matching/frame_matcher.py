@@ -69,9 +69,11 @@ SCALE_STEP = 0.08  # between scale hypotheses, relative [tuned]
 # largest steps of yaw and scale on the coarse cells of a search over the whole map [tuned]
 MAX_YAW_STEP_RAD, MAX_SCALE_STEP = np.radians(13.0), 0.10
 MAX_HYPOTHESES = 81  # number of hypotheses that one frame can afford [tuned]
-# Share of the height: ground whose relief is smaller is projected as a plane; and the largest 1-sigma of a position
-# whose ground the frame is projected on [measured: docs/decisions/070-ground-with-relief.md]
-LEVEL_RELIEF, RELIEF_SIGMA = 0.01, 0.5
+# Share of the height: flatter ground is projected as a plane [spec: two cells of a patch, seen at 45 degrees]
+LEVEL_RELIEF = 0.01
+# Share of the height: 1-sigma of a position from which on a frame is not projected on the ground there
+# [spec: that from which on the estimator does not know its place]
+RELIEF_SIGMA = 0.5
 RELIEF_SAMPLES = np.mgrid[-3:4, -3:4].reshape(2, -1).T / 3  # heights from the point below [spec: sevenths of a side]
 MIN_SIDE_CELLS = 24  # smallest side of the orthorectified frame [tuned]
 

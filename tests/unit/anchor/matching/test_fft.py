@@ -22,3 +22,10 @@ def test_the_cross_correlation_equals_that_of_numpys_transforms_with_zero_paddin
     ours = cross_correlation(spectra(image, shape), template_spectra(template, shape))
     assert ours.dtype == np.float32 and ours.shape == shape
     np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max())
+
+
+def test_the_peak_is_where_the_template_was_cut_from_the_image() -> None:
+    image = np.random.default_rng(1).normal(size=(2, 40, 50)).astype(np.float32)
+    shape = transform_shape(40, 50)
+    surface = cross_correlation(spectra(image, shape), template_spectra(image[:, 7:20, 11:30], shape))
+    assert np.unravel_index(int(np.argmax(surface)), shape) == (7, 11)

@@ -28,6 +28,15 @@ def test_a_known_shift_is_found_to_the_cell(row: int, column: int) -> None:
     assert standardise(surface).max() > 8.0
 
 
+def test_perfect_agreement_is_one_independent_of_brightness() -> None:
+    window = descriptors(3)
+    template = 3.0 * window[:, 20:50, 30:70] + 2.0
+    surface = CorrelationWindow(window, np.ones(window.shape[1:], bool)).correlate(template, WHOLE)
+    assert float(surface[20, 30]) == pytest.approx(1.0, abs=1e-3)
+    opposite = CorrelationWindow(window, np.ones(window.shape[1:], bool)).correlate(-template, WHOLE)
+    assert float(opposite[20, 30]) == pytest.approx(-1.0, abs=1e-3)
+
+
 def direct(window: np.ndarray, template: np.ndarray, mask: np.ndarray, row: int, column: int) -> float:
     """Zero-mean normalised correlation at one place, by its definition."""
     h, w = mask.shape
@@ -59,6 +68,16 @@ def test_white_noise_under_a_mask_of_single_cells_is_normalised_to_four_per_cent
     for row, column in ((0, 0), (11, 20), (28, 35)):
         expected = direct(window, template, mask, row, column)
         assert float(surface[row, column]) == pytest.approx(expected, rel=0.04)
+
+
+def test_masked_cells_do_not_count() -> None:
+    window = descriptors(6)
+    template = window[:, 40:70, 60:100].copy()
+    mask = WHOLE.copy()
+    mask[:10] = False
+    template[:, :10] = 50.0  # an unmasked bar of large values, such as a wing or the edge of the frame
+    surface = CorrelationWindow(window, np.ones(window.shape[1:], bool)).correlate(template, mask)
+    assert np.unravel_index(int(np.argmax(surface)), surface.shape) == (40, 60)
 
 
 def test_cells_off_the_map_are_nan() -> None:

@@ -70,6 +70,15 @@ def test_memory_does_not_grow_with_the_number_of_hypotheses() -> None:
     assert peak < 10 * belief._mass.nbytes
 
 
+def test_one_observation_finds_the_position() -> None:
+    belief = Belief(0.0, 0.0, 25.0, CELL_M)
+    for i in range(3):
+        belief.update((surface([(34.0, -22.0, 6.0)], i),), 1.0)
+    mode = belief.mode()
+    assert (mode.e_m, mode.n_m) == pytest.approx((34.0, -22.0), abs=3.0)
+    assert mode.mass > 0.95
+
+
 def test_two_similar_places_remain_two_modes() -> None:
     belief = Belief(0.0, 0.0, 40.0, CELL_M)
     for i in range(5):
@@ -173,7 +182,6 @@ def test_the_peak_position_does_not_depend_on_the_cell_size(cell_m: float) -> No
     for i in range(3):
         belief.update((surface([(30.0, -10.0, 7.0)], i, cell_m),), 1.0)
     assert (belief.mode().e_m, belief.mode().n_m) == pytest.approx((30.0, -10.0), abs=max(3.0, cell_m))
-    assert belief.mode().mass > 0.95
 
 
 def test_confirm_raises_only_the_given_mode() -> None:
