@@ -14,7 +14,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Metadata
+from mcap.records import Channel, Chunk, McapRecord, Metadata, Statistics
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
@@ -29,6 +29,7 @@ from terrafix.recorder.writer import CALIBRATION_NAME, HEADER_NAME, SOURCE_NAME,
 _SEGMENT = re.compile(r"flight-(\d+)\.mcap$")
 _RECORD_LIMIT_BYTES = 64 * 1024 * 1024  # more than any valid record; a corrupt length must not allocate gigabytes
 _FRAMING = struct.Struct("<BQ")  # opcode and length of each record (https://mcap.dev/spec)
+_FOOTER_BYTES = 20  # [spec: the same]
 
 # Exceptions of a truncated or corrupt record: invalid length, compression, checksum or text.
 _CORRUPT = (
@@ -216,10 +217,17 @@ def _decoded(text: str) -> Any:
 
 def _contents(file: Path, stream: IO[bytes], result: ReadResult) -> Iterator[McapRecord]:
     """Yields the records of a file that matter here. A part that does not agree with its checksum or cannot be parsed
-    is left out whole and named in ``result``; the parts after it are read."""
+    is left out whole and named in ``result``; the parts after it are read. A chunk whose opcode is damaged is missed in
+    the statistics at the end of the file: an opcode has no checksum."""
+    chunks = 0
     try:
         for offset, opcode, content in _framed(stream):
+            chunks += opcode == Opcode.CHUNK
             try:
+                if opcode == Opcode.STATISTICS:
+                    written = Statistics.read(ReadDataStream(BytesIO(content))).chunk_count
+                    if written != chunks:
+                        result.damaged.append(f"{file.name}: {chunks} of {written} chunks can be recognised")
                 yield from _parse(opcode, content)
             except _CORRUPT as error:
                 result.damaged.append(f"{file.name}, byte {offset}: {error or type(error).__name__}")
@@ -239,7 +247,7 @@ def _framed(stream: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
         if len(head) < _FRAMING.size:
             raise EndOfFile
         opcode, length = _FRAMING.unpack(head)
-        if length > _RECORD_LIMIT_BYTES:
+        if length > _RECORD_LIMIT_BYTES or (opcode == Opcode.FOOTER and length != _FOOTER_BYTES):
             raise McapError(f"a record of {length} bytes")
         content = stream.read(length)
         if len(content) < length:

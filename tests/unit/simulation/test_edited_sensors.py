@@ -20,7 +20,7 @@ class Perfect:
     def read(self, state: State) -> Readings:
         angles = state.yaw_rad, state.pitch_rad, state.roll_rad
         held = Gimbal(error_deg=0.0).reported(state)
-        return Readings(state.t_s, ZERO, ZERO, *angles, float(state.p_b_in_w_m[2]), None, None, None, held)
+        return Readings(state.t_s, ZERO, ZERO, *angles, float(state.p_b_in_w_m[2]), None, None, held)
 
 
 def read(fault: str, span: Span, zero_s: float = 0.0) -> list[Readings]:
