@@ -73,5 +73,5 @@ def open_complete(model: StoredModel, *, prefer: tuple[str, ...] = providers.PRE
 
 
 def _row(model: StoredModel, state: State) -> dict[str, Any]:
-    told = ("name", "title", "role", "size_bytes", "sha256", "licence", "credit", "source")
-    return {key: getattr(model.manifest, key) for key in told} | {"state": state.value, "path": str(model.path)}
+    listed = ("name", "title", "role", "size_bytes", "sha256", "licence", "credit", "source")
+    return {key: getattr(model.manifest, key) for key in listed} | {"state": state.value, "path": str(model.path)}

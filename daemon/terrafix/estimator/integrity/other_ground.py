@@ -43,8 +43,8 @@ class OtherGround:
 
     def on_nothing(self, at_m: np.ndarray, height_m: float, p_nothing: float) -> None:
         """No pose was found over textured ground at ``at_m`` (2,), ``height_m`` above it. ``p_nothing``: probability of
-        that over ground which the map shows (MapHitRate). By itself it widens no claim: it says how far a pose that
-        is found there, or is rejected, is believed."""
+        that over ground which the map shows (MapHitRate). By itself it widens no claim: it is the prior by which a
+        pose that is found there, or is rejected, is weighed."""
         if (
             self._nothing_at_m is None
             or np.hypot(*(at_m - self._nothing_at_m)) >= REGISTRATION_SPACING_HEIGHTS * height_m

@@ -63,9 +63,9 @@ class EstimateGate:
             return Verdict.IMPLAUSIBLE, problem
         if estimate.t_ns > now_ns + MAX_FUTURE_NS:
             return Verdict.IMPLAUSIBLE, f"from the future by {(estimate.t_ns - now_ns) / 1e6:.0f} ms"
-        blind = inertial.delta(estimate, now_ns) is None
-        if now_ns - estimate.t_ns > (MAX_BLIND_DELAY_NS if blind else MAX_DELAY_NS):
-            return Verdict.STALE, f"{(now_ns - estimate.t_ns) / 1e9:.1f} s old on arrival"
+        age_ns = now_ns - estimate.t_ns
+        if age_ns > MAX_DELAY_NS or (age_ns > MAX_BLIND_DELAY_NS and inertial.delta(estimate, now_ns) is None):
+            return Verdict.STALE, f"{age_ns / 1e9:.1f} s old on arrival"
         newest = self._candidate or self.accepted
         if newest is not None and estimate.t_ns < newest.t_ns:
             return Verdict.STALE, "older than one already received"
