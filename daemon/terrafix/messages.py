@@ -327,7 +327,8 @@ class MapPose(msgspec.Struct, frozen=True, kw_only=True):
     p_c_in_w_m: Vec3
     q_w_c: Quat
     cov: Mat6
-    # Position of a mode of the posterior, attitude as predicted: there are no consistent 2D-3D matches.
+    # Position of a mode of the posterior, which earlier frames have selected too; attitude as predicted: there are no
+    # consistent 2D-3D matches.
     position_only: bool = False
 
 

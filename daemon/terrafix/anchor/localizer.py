@@ -23,7 +23,7 @@ from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, View, view_at
 from terrafix.anchor.matching.layer_selector import POOR_SCORE
 from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
-from terrafix.anchor.matching.match_message import pose_match
+from terrafix.anchor.matching.match_message import mode_match, pose_match
 from terrafix.anchor.matching.point_mass_filter import MAX_HALF_CELLS, Belief, Mode, belief_cell_m
 from terrafix.anchor.matching.predicted_view import (
     VAR_E,
@@ -298,7 +298,8 @@ class Localizer:
         pose = estimate_pose(match, prediction, seen, modes[0], hypothesis)
         # Not "seen.new >= 1": a copter's observations are closer to each other than that, and none would be used.
         is_new_ground = self._since_single_frame_m >= NEW_GROUND_SHARE * seen.footprint_m
-        if not pose.attempted and not seen.layer.drawn and is_new_ground and has_wide_sigma(sigma_m, view.agl_m):
+        is_placed = pose.match.verdict is Verdict.ACCEPTED
+        if not is_placed and not seen.layer.drawn and is_new_ground and has_wide_sigma(sigma_m, view.agl_m):
             pose = self._localize_alone(pose, seen, belief)
         self._lock_monitor.update(evidence_nats, seen.weight, seen.new, pose.inliers, sigma_m, view.agl_m)
         mode_view = view_at(view, hypothesis, pose.mode.e_m, pose.mode.n_m) if pose.attempted else None
@@ -357,21 +358,27 @@ class Localizer:
             belief.fit_window(belief.half_m * WIDEN_FACTOR)
 
     def _localize_alone(self, pose: PoseResult, seen: Observation, belief: Belief) -> PoseResult:
-        """Selection of a mode by the patches of this frame alone; ``pose`` itself if no mode is selected."""
+        """Selection of a mode by this frame alone; ``pose`` itself if no mode is selected."""
         view, layer = seen.view, seen.layer
         self._since_single_frame_m = 0.0
         self._single_frame_budget.spend()
-        null, log_probability = layer.null_at(view.agl_m), self._single_frame_budget.log_probability
+        null, log_probability = layer.null_at(view.agl_m).look, self._single_frame_budget.log_probability
         place = localize_single_frame(
             seen.image, view, seen.correlation, belief.modes(MAX_MODES), layer.matcher, null, log_probability
         )
         if place is None:
             return pose
-        mode, fix = place
+        mode = place.mode
         assert pose.match.place is not None
         there = MatchPlace(e_m=mode.e_m, n_m=mode.n_m, mass=pose.match.place.mass)
-        match = pose_match(msgspec.structs.replace(pose.match, place=there), fix, view)
-        return PoseResult(match, mode, attempted=match.verdict is Verdict.ACCEPTED, likelihood_ratio=LIKELIHOOD_RATIO)
+        match = msgspec.structs.replace(pose.match, place=there)
+        if place.fix is not None:
+            match = pose_match(match, place.fix, view)
+        if match.verdict is not Verdict.ACCEPTED:
+            scale = seen.correlation.scale_at(mode.e_m, mode.n_m)
+            turned = replace(view, r_w_c=place.view.r_w_c)
+            match = mode_match(match, mode, belief.cell_m, turned, scale, alone=True)
+        return PoseResult(match, mode, attempted=True, likelihood_ratio=LIKELIHOOD_RATIO)
 
 
 def initial_belief(prediction: Prediction, cell_m: float) -> tuple[Belief, float]:

@@ -36,7 +36,7 @@ from terrafix.core.errors import MapError, OutputError, UsageError
 from terrafix.core.geodesy import LocalFrame, local_rotation_up
 from terrafix.core.node import Image
 from terrafix.core.toml_file import read_toml
-from terrafix.map.null_model import DEFAULT_NULL, NullRow
+from terrafix.map.null_model import DEFAULT_NULL, Tail
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix.messages import Verdict
 from terrafix.vision.sources import open_source
@@ -46,7 +46,7 @@ from terrafix_tools.evaluate import read_truth
 from terrafix_tools.flight_map import package_of
 from terrafix_tools.map_probe import reported_view
 from terrafix_tools.mapping.check.sight import YAW_SIGMA_RAD
-from terrafix_tools.mapping.package.null_model import FLIGHTS, STRETCHES, fit_null_row
+from terrafix_tools.mapping.package.null_model import FLIGHTS, STRETCHES, fit_look_tail
 from terrafix_tools.models.known import as_model_errors
 from terrafix_tools.models.two_dates import CAMERA, TwoDates
 
@@ -89,12 +89,12 @@ class Ground:
     frames: list[Frame]
 
     @functools.cached_property
-    def null(self) -> NullRow:
+    def null(self) -> Tail:
         """Of this map at the height of the frames; the general one where the map is too small to learn it."""
         try:
-            return fit_null_row(self.source, self.frames[0].predicted.agl_m, FLIGHTS, STRETCHES)
+            return fit_look_tail(self.source, self.frames[0].predicted.agl_m, FLIGHTS, STRETCHES)
         except UsageError:
-            return DEFAULT_NULL
+            return DEFAULT_NULL.look
 
 
 @dataclass(frozen=True)
@@ -227,10 +227,12 @@ def _methods_on(
 def _place(
     image: Image, view: View, found: CorrelationResult, ground: Ground, matcher: FrameMatcher, modes: list[Mode]
 ) -> np.ndarray | None:
-    """East and north of the pose in the mode that the patches choose."""
+    """East and north of the place that the frame is given."""
     placed = localize_single_frame(image, view, found, modes, matcher, ground.null, math.log(FALSE_ALARMS))
-    fit = None if placed is None else placed[1].pnp.fit
-    return None if fit is None else fit.p_c_in_w_m[:2]
+    if placed is None:
+        return None
+    fit = None if placed.fix is None else placed.fix.pnp.fit
+    return np.array([placed.mode.e_m, placed.mode.n_m]) if fit is None else fit.p_c_in_w_m[:2]
 
 
 def _prior(

@@ -32,12 +32,15 @@ RELOCALIZED_SIGMA = 0.02
 MAX_MODE_DRIFT = 0.35
 
 
-def mode_match(match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tuple[float, float] | None) -> MapMatch:
+def mode_match(
+    match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tuple[float, float] | None, *, alone: bool = False
+) -> MapMatch:
     """Pose measurement from the position of the belief's mode, with a covariance that constrains position only.
 
     The correlation measures the ground below the optical axis, so position and tilt errors are correlated: p_e moves by
     +h and p_n by -h per radian of rotation about north and east (h = height above ground). ``scale``: ratio of measured
-    to predicted height and its variance; None if no scale was measured.
+    to predicted height and its variance; None if no scale was measured. ``alone``: the frame has selected the mode
+    without the frames before it.
     """
     agl_m, height_m = view.agl_m, COARSE_HEIGHT_M
     if scale is not None:
@@ -63,7 +66,7 @@ def mode_match(match: MapMatch, mode: Mode, cell_m: float, view: View, scale: tu
             p_c_in_w_m=(mode.e_m, mode.n_m, view.ground_m + agl_m),
             q_w_c=quat_from_rot(view.r_w_c),
             cov=tuple(float(v) for v in cov.ravel()),
-            position_only=True,
+            position_only=not alone,
         ),
     )
 

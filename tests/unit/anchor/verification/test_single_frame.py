@@ -7,11 +7,19 @@ import pytest
 
 from map_matches import position_of
 from single_map_place import AGL_M, ORIGIN, SIDE_M, TRUE_M, R, SingleMapPackage, predicted
-from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, CorrelationResult, FrameMatcher, View
+from terrafix.anchor.matching.frame_matcher import (
+    AS_PREDICTED,
+    CorrelationResult,
+    FrameMatcher,
+    Hypothesis,
+    View,
+)
+from terrafix.anchor.matching.match_message import ground_cov_m2
 from terrafix.anchor.matching.point_mass_filter import Belief, Mode
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.verification.single_frame import localize_single_frame
+from terrafix.anchor.verification.single_frame import SingleFramePlace, localize_single_frame
 from terrafix.core.frames import MemoryFrameStore
+from terrafix.core.geodesy import local_rotation_up, rot_from_quat
 from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget, Tail
 from terrafix.messages import MapMatch, Verdict
 from terrafix_engines.features.gradient import GradientDescriber
@@ -39,12 +47,12 @@ def selected_mode(
     matcher = FrameMatcher(PINHOLE, source, GradientDescriber())
     predicted = View(0.0, 0.0, R, AGL_M, 0.0, 0.03, 0.02, 0.03)
     found = localize_single_frame(
-        frame, predicted, SameResult(Verdict.ACCEPTED), modes, matcher, DEFAULT_NULL, log_probability
+        frame, predicted, SameResult(Verdict.ACCEPTED), modes, matcher, DEFAULT_NULL.look, log_probability
     )
     if found is None:
         return None
-    assert found[1].pnp.fit is not None
-    return found[0], found[1].pnp.fit.p_c_in_w_m
+    assert found.fix is not None and found.fix.pnp.fit is not None
+    return found.mode, found.fix.pnp.fit.p_c_in_w_m
 
 
 def test_the_patches_select_the_right_mode(ground: np.ndarray) -> None:
@@ -54,8 +62,51 @@ def test_the_patches_select_the_right_mode(ground: np.ndarray) -> None:
     assert np.linalg.norm(found[1] - TRUE_M) < 3.0
 
 
+def test_a_clear_correlation_selects_a_mode_that_patches_do_not_confirm(ground: np.ndarray) -> None:
+    """The place is that of the mode: patches that agree little give no pose."""
+
+    class ClearResult(CorrelationResult):
+        def best_at(self, e_m: float, n_m: float) -> tuple[Any, float]:
+            return Hypothesis(0.1, 1.0), 12.0 if (e_m, n_m) == (80.0, 70.0) else 3.0
+
+    source: Any = FlatMap(ground)
+    other, clear = view(texture(9, SIDE_M), PINHOLE, R, TRUE_M), mode(80.0, 70.0)
+    found = localize_single_frame(
+        other,
+        View(0.0, 0.0, R, AGL_M, 0.0, 0.03, 0.02, 0.03),
+        ClearResult(Verdict.ACCEPTED),
+        [mode(-60.0, 40.0), clear],
+        FrameMatcher(PINHOLE, source, GradientDescriber()),
+        DEFAULT_NULL.look,
+        SHARE,
+    )
+    assert found is not None and found.mode is clear and found.fix is None
+    assert np.allclose(found.view.r_w_c, local_rotation_up(0.1) @ R)
+
+
+def test_a_place_without_a_pose_is_published_as_one_that_earlier_frames_have_no_part_in(
+    ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # no evidence
+    turned = View(*TRUE_M[:2], local_rotation_up(0.1) @ R, AGL_M, 0.0, 0.03, 0.02, 0.03)
+    monkeypatch.setattr(
+        "terrafix.anchor.localizer.localize_single_frame",
+        lambda *of: SingleFramePlace(mode(*TRUE_M[:2]), turned, None),
+    )
+    package: Any = SingleMapPackage(ground)
+    frames = MemoryFrameStore(2)
+    node = AnchorNode(frames, package, GradientDescriber(), 1.0)
+    list(node.on(ORIGIN))
+    frames.put(1, view(ground, PINHOLE, R, TRUE_M))
+    match, *_ = node.on(predicted(1, 90.0, at_m=TRUE_M))
+    assert isinstance(match, MapMatch) and match.verdict is Verdict.ACCEPTED and match.pose is not None
+    assert not match.position_only and match.pose.p_c_in_w_m[:2] == pytest.approx(TRUE_M[:2])
+    assert np.allclose(rot_from_quat(match.pose.q_w_c), turned.r_w_c)
+    sigma_m = np.sqrt(np.linalg.eigvalsh(ground_cov_m2(match.pose.cov, AGL_M)))
+    assert (sigma_m >= np.hypot(3.0, 0.03 * AGL_M)).all() and (sigma_m < 0.1 * AGL_M).all()
+
+
 def test_a_lower_false_alarm_probability_requires_more_evidence(ground: np.ndarray) -> None:
-    """The best of three wrong places exceeds the threshold with three times the probability of one."""
     frame, modes = view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), mode(*TRUE_M[:2])]
     assert selected_mode(ground, frame, modes) is not None
     assert selected_mode(ground, frame, modes, log_probability=-60.0) is None
@@ -73,7 +124,7 @@ def test_the_threshold_of_a_single_frame_comes_from_the_null_model_of_the_map(
     monkeypatch.setattr(Tail, "exceedance_value", enough)
     frame, modes = view(ground, PINHOLE, R, TRUE_M), [mode(-60.0, 40.0), mode(80.0, 70.0), mode(*TRUE_M[:2])]
     assert selected_mode(ground, frame, modes) is None
-    assert log_probabilities[0] == pytest.approx(SHARE - np.log(3.0))
+    assert log_probabilities == [SHARE]
 
 
 def test_ground_that_is_not_on_the_map_selects_no_mode(ground: np.ndarray) -> None:
