@@ -88,7 +88,7 @@ def test_a_place_without_a_pose_is_published_as_one_that_earlier_frames_have_no_
     ground: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Belief, "update", lambda *_: 0.0)  # no evidence
-    turned = View(*TRUE_M[:2], local_rotation_up(0.1) @ R, AGL_M, 0.0, 0.03, 0.02, 0.03)
+    turned = View(float(TRUE_M[0]), float(TRUE_M[1]), local_rotation_up(0.1) @ R, AGL_M, 0.0, 0.03, 0.02, 0.03)
     monkeypatch.setattr(
         "terrafix.anchor.localizer.localize_single_frame",
         lambda *of: SingleFramePlace(mode(*TRUE_M[:2]), turned, None),
