@@ -359,12 +359,12 @@ class Localizer:
 
     def _localize_alone(self, pose: PoseResult, seen: Observation, belief: Belief) -> PoseResult:
         """Selection of a mode by this frame alone; ``pose`` itself if no mode is selected."""
-        view, layer = seen.view, seen.layer
+        view = seen.view
         self._since_single_frame_m = 0.0
         self._single_frame_budget.spend()
-        null, log_probability = layer.null_at(view.agl_m).look, self._single_frame_budget.log_probability
+        log_probability = self._single_frame_budget.log_probability
         place = localize_single_frame(
-            seen.image, view, seen.correlation, belief.modes(MAX_MODES), layer.matcher, null, log_probability
+            seen.image, view, seen.correlation, belief.modes(MAX_MODES), seen.layer.matcher, log_probability
         )
         if place is None:
             return pose

@@ -13,7 +13,7 @@ from typing import Self
 import msgspec
 import numpy as np
 
-SCORE_VERSION = 2  # version of the score definition; a stored model of another version is not used
+SCORE_VERSION = 1  # version of the score definition; a stored model of another version is not used
 # Probability of a false detection over a whole flight, for a vehicle that is nowhere on the map: half for the search,
 # half for single-frame localization.
 FALSE_DETECTIONS_PER_FLIGHT = 1e-3
@@ -67,15 +67,13 @@ class NullRow(msgspec.Struct, frozen=True, kw_only=True):
     ``search``: tail of the log likelihood ratio of the best place in a stretch of new ground, out of ``places``
     candidates. ``frame``: tail of a single frame's score at a verified place, in standard deviations of
     ``verification.patch_null.PatchNull``. ``patches``: mean and standard deviation of those scores, in the same units
-    before online adaptation. ``look``: tail of the highest score of one look over the map, in nats of
-    ``verification.single_frame``."""
+    before online adaptation."""
 
     agl_m: float
     places: float
     search: Tail
     frame: Tail
     patches: tuple[float, float]
-    look: Tail
 
     def detection_threshold(self, places: float, log_probability: float) -> float:
         """Detection threshold (log likelihood ratio): exceeded by the best of ``places`` wrong ones at this rate."""
@@ -103,7 +101,6 @@ DEFAULT_NULL = NullRow(
     search=Tail(above=2.2, share=0.1, count=39.0, excess=58.0),
     frame=Tail(above=1.5, share=0.1, count=391.0, excess=240.0),
     patches=(0.0, 1.0),
-    look=Tail(above=22.0, share=0.1, count=40.0, excess=60.0),
 )
 
 

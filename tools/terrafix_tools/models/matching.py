@@ -32,11 +32,10 @@ from terrafix.anchor.matching.point_mass_filter import MAX_HALF_CELLS, Belief, M
 from terrafix.anchor.relocalization.position_prior import distance_outside_m
 from terrafix.anchor.verification.single_frame import MAX_MODES, localize_single_frame
 from terrafix.core.camera import CameraCalibration
-from terrafix.core.errors import MapError, OutputError, UsageError
+from terrafix.core.errors import MapError, OutputError
 from terrafix.core.geodesy import LocalFrame, local_rotation_up
 from terrafix.core.node import Image
 from terrafix.core.toml_file import read_toml
-from terrafix.map.null_model import DEFAULT_NULL, Tail
 from terrafix.map.package import LocalMap, MapPackage
 from terrafix.messages import Verdict
 from terrafix.vision.sources import open_source
@@ -46,7 +45,6 @@ from terrafix_tools.evaluate import read_truth
 from terrafix_tools.flight_map import package_of
 from terrafix_tools.map_probe import reported_view
 from terrafix_tools.mapping.check.sight import YAW_SIGMA_RAD
-from terrafix_tools.mapping.package.null_model import FLIGHTS, STRETCHES, fit_look_tail
 from terrafix_tools.models.known import as_model_errors
 from terrafix_tools.models.two_dates import CAMERA, TwoDates
 
@@ -87,14 +85,6 @@ class Ground:
     source: LocalMap
     camera: CameraCalibration
     frames: list[Frame]
-
-    @functools.cached_property
-    def null(self) -> Tail:
-        """Of this map at the height of the frames; the general one where the map is too small to learn it."""
-        try:
-            return fit_look_tail(self.source, self.frames[0].predicted.agl_m, FLIGHTS, STRETCHES)
-        except UsageError:
-            return DEFAULT_NULL.look
 
 
 @dataclass(frozen=True)
@@ -218,21 +208,18 @@ def _methods_on(
             seen = {n: _correlated(n, one, matchers[n], image, view, belief_at()) for n, one in describers.items()}
             for name in names:
                 chosen = [seen[one] for one in name]
-                place = functools.partial(_place, image, view, chosen[-1][0], ground, matchers[GRADIENTS])
+                place = functools.partial(_place, image, view, chosen[-1][0], matchers[GRADIENTS])
                 (nulls if mirrored else looks)[name].append(_look(chosen, frame, belief_at(), place))
     for name in names:
         yield _summary("+".join(name), looks[name], nulls[name])
 
 
 def _place(
-    image: Image, view: View, found: CorrelationResult, ground: Ground, matcher: FrameMatcher, modes: list[Mode]
+    image: Image, view: View, found: CorrelationResult, matcher: FrameMatcher, modes: list[Mode]
 ) -> np.ndarray | None:
-    """East and north of the place that the frame is given."""
-    placed = localize_single_frame(image, view, found, modes, matcher, ground.null, math.log(FALSE_ALARMS))
-    if placed is None:
-        return None
-    fit = None if placed.fix is None else placed.fix.pnp.fit
-    return np.array([placed.mode.e_m, placed.mode.n_m]) if fit is None else fit.p_c_in_w_m[:2]
+    """East and north of the mode that the frame selects."""
+    placed = localize_single_frame(image, view, found, modes, matcher, math.log(FALSE_ALARMS))
+    return None if placed is None else np.array([placed.mode.e_m, placed.mode.n_m])
 
 
 def _prior(

@@ -2,9 +2,9 @@
 together select one of its modes.
 
 One correlation with a whole map rarely leaves one mode, and without overlap no later frame discriminates between them.
-The patches of the frame do, but where buildings lean or are gone they confirm little. So the nats of both are added,
-and the sum is compared with what it reaches at the best wrong place of the map. A place is accepted if it exceeds that,
-and every other place.
+The patches of the frame do, but where buildings lean or are gone they confirm little. So the nats of both are added. A
+place is accepted if it exceeds every other one, and their mean by more than the best of wrong places does: they are the
+null model, ground of this map as this frame sees it.
 """
 
 from collections.abc import Sequence
@@ -31,6 +31,9 @@ MAX_MODES = 8
 # Nats per standard deviation of the patches: decay of the tail of wrong places, as ``BELIEF_LLR_SLOPE`` of the
 # correlation. [spec: DEFAULT_NULL.frame]
 PATCH_LLR_SLOPE = DEFAULT_NULL.frame.count / DEFAULT_NULL.frame.excess
+# Nats of the best place over the mean of the others where all are wrong.
+# [measured: docs/decisions/072-correlation-and-patches-in-one-score.md]
+EXCESS_NULL = Tail(above=5.7, share=0.1, count=36.0, excess=28.2)
 LIKELIHOOD_RATIO = float(np.exp(TRACK_LLR_MAX))  # factor on the mass of the accepted mode [spec: exp(TRACK_LLR_MAX)]
 
 
@@ -78,12 +81,10 @@ def localize_single_frame(
     correlation: CorrelationResult,
     modes: Sequence[Mode],
     matcher: FrameMatcher,
-    null: Tail,
     log_probability: float,
 ) -> SingleFramePlace | None:
-    """``modes``: of the belief after this frame's correlation. ``null``: tail of the highest score where the frame is
-    on none of the map; ``log_probability``: allowed false-alarm probability of this frame. None: no place, or more
-    than one."""
+    """``modes``: of the belief after this frame's correlation; ``log_probability``: allowed false-alarm probability of
+    this frame. None: no place, or more than one."""
     verifier = PlaceVerifier(matcher)
     scored = scored_modes(image, view, correlation, modes, verifier)
     if not scored:
@@ -91,7 +92,9 @@ def localize_single_frame(
     best, mode = scored[0], scored[0].mode
     near_m = NEIGHBOUR_RADIUS * view.agl_m  # within this distance the patches match the same place
     rivals = [s.score for s in scored if np.hypot(s.mode.e_m - mode.e_m, s.mode.n_m - mode.n_m) > near_m]
-    if best.score < max([null.exceedance_value(log_probability), *(r + DECISION_MARGIN for r in rivals)]):
+    if not rivals or best.score < max(rivals) + DECISION_MARGIN:
+        return None
+    if best.score < np.mean(rivals) + EXCESS_NULL.exceedance_value(log_probability):
         return None
     fix = None
     if evidence(best.sigmas) >= TRACK_LLR_MAX and best.place.fix.pnp.fit is not None:

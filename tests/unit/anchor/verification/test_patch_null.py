@@ -23,7 +23,7 @@ PRIOR = Tail(above=0.0, share=0.1, count=10.0, excess=20.0)  # falls by a factor
 
 
 def row(agl_m: float = 100.0, places: float = 1000.0) -> NullRow:
-    return NullRow(agl_m=agl_m, places=places, search=PRIOR, frame=PRIOR, patches=(0.0, 1.0), look=PRIOR)
+    return NullRow(agl_m=agl_m, places=places, search=PRIOR, frame=PRIOR, patches=(0.0, 1.0))
 
 
 def test_a_fitted_tail_reproduces_the_exceedance_probabilities_of_its_values() -> None:
@@ -99,7 +99,7 @@ def test_repeated_decisions_accept_wrong_places_within_the_false_alarm_budget() 
     """Flights of forty decisions over places whose evidence follows the null model."""
     draw, flights, decisions, share = np.random.default_rng(5), 4000, 40, 0.05
     tail = Tail(above=2.0, share=0.1, count=1e6, excess=1.5e6)
-    null = NullRow(agl_m=100.0, places=1000.0, search=tail, frame=tail, patches=(0.0, 1.0), look=tail)
+    null = NullRow(agl_m=100.0, places=1000.0, search=tail, frame=tail, patches=(0.0, 1.0))
     found = 0
     for _ in range(flights):
         budget = FalseAlarmBudget(share)

@@ -13,11 +13,8 @@ import msgspec
 import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import FrameMatcher, View
-from terrafix.anchor.matching.point_mass_filter import Belief, belief_cell_m
 from terrafix.anchor.relocalization.map_search import MapSearch
 from terrafix.anchor.verification.hypothesis_tracker import NEW_EVIDENCE
-from terrafix.anchor.verification.place_verifier import PlaceVerifier
-from terrafix.anchor.verification.single_frame import MAX_MODES, scored_modes
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
@@ -25,7 +22,6 @@ from terrafix.core.node import Image
 from terrafix.map.format import Layer
 from terrafix.map.null_model import DEFAULT_NULL, SCORE_VERSION, FalseAlarmBudget, NullModel, NullRow, Tail
 from terrafix.map.package import LocalMap, MapPackage
-from terrafix.messages import Verdict
 from terrafix_engines.features.gradient import GradientDescriber
 from terrafix_tools.mapping.check.sight import NORTH_UP
 from terrafix_tools.mapping.package.rewrite import rewrite_manifest
@@ -36,7 +32,6 @@ YAW_SIGMA_RAD, SCALE_SIGMA, TILT_SIGMA_RAD = math.radians(11.0), 0.06, math.radi
 STEP_SIGMA = 0.01  # 1-sigma of an odometry step, fraction of the height
 STEPS_PER_STRETCH = 2
 FLIGHTS, STRETCHES = 10, 6  # about two minutes of one core per height
-LOOK_SIGMA_M = 200.0  # per axis: the position of a frame from which the next one does not know its own
 DRAWS = 40  # attempts to find the ground of one flight
 VALID = 0.98  # minimum fraction of valid ground of a flight
 SEED = 1  # fixed, so that the model is deterministic
@@ -99,27 +94,7 @@ def fit_null_row(source: LocalMap, agl_m: float, flights: int, stretches: int) -
         search=Tail.fit(best, DEFAULT_NULL.search),
         frame=Tail.fit(sigmas, DEFAULT_NULL.frame),
         patches=(round(float(mean), 4), round(float(sigma), 4)),
-        look=fit_look_tail(source, agl_m, flights, stretches),
     )
-
-
-def fit_look_tail(source: LocalMap, agl_m: float, flights: int, stretches: int) -> Tail:
-    """Tail of the highest score of one look around a place that is known to ``LOOK_SIGMA_M``, one for each stretch.
-    Raises UsageError."""
-    draw, matcher = np.random.default_rng(SEED), FrameMatcher(CAMERA, source, GradientDescriber())
-    e_min, n_min, e_max, n_max = source.bounds_m
-    cell_m, view, best = belief_cell_m(agl_m, source.gsd_m), _predicted_view(agl_m), list[float]()
-    for _ in range(flights):
-        strip = _strip(source, agl_m, stretches, draw)
-        for stretch in range(stretches):
-            image = strip.frame(stretch * STEPS_PER_STRETCH)
-            belief = Belief(draw.uniform(e_min, e_max), draw.uniform(n_min, n_max), LOOK_SIGMA_M, cell_m)
-            found = matcher.correlate(image, view, belief)
-            if found.verdict is Verdict.ACCEPTED:
-                belief.update(found.surfaces, 1.0)
-                scored = scored_modes(image, view, found, belief.modes(MAX_MODES), PlaceVerifier(matcher))
-                best += [one.score for one in scored[:1]]
-    return Tail.fit(best, DEFAULT_NULL.look)
 
 
 def _predicted_view(agl_m: float) -> View:
