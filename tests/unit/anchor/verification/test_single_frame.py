@@ -120,9 +120,11 @@ def test_repeated_ground_selects_no_mode(ground: np.ndarray) -> None:
     twice = np.hstack([half, half])
     places = [np.array([e_m, 0.0, AGL_M]) for e_m in (-110.0, 110.0)]
     frame = view(twice, PINHOLE, R, places[0])
-    assert selected_mode(twice, frame, [mode(*place[:2]) for place in places]) is None
-    elsewhere = mode(*places[0][:2] + np.array([50.0, 60.0]))
-    assert selected_mode(twice, frame, [mode(*places[0][:2]), elsewhere]) is not None
+    elsewhere = [mode(places[0][0] + e_m, n_m) for e_m in (-60.0, 60.0) for n_m in (-70.0, 0.0, 70.0)]
+    here, there = (mode(*place[:2]) for place in places)
+    assert selected_mode(twice, frame, [here, there, *elsewhere]) is None
+    assert selected_mode(twice, frame, [here, *elsewhere]) is not None
+    assert selected_mode(twice, frame, [here]) is None, "nothing to compare it with"
 
 
 @pytest.mark.slow
