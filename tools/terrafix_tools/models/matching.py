@@ -217,9 +217,12 @@ def _methods_on(
 def _place(
     image: Image, view: View, found: CorrelationResult, matcher: FrameMatcher, modes: list[Mode]
 ) -> np.ndarray | None:
-    """East and north of the mode that the frame selects."""
+    """East and north of the place that the frame is given, with its stated tilt."""
     placed = localize_single_frame(image, view, found, modes, matcher, math.log(FALSE_ALARMS))
-    return None if placed is None else np.array([placed.mode.e_m, placed.mode.n_m])
+    if placed is None:
+        return None
+    fit = None if placed.fix is None else placed.best.place.fix.pnp.fit
+    return np.array([placed.best.mode.e_m, placed.best.mode.n_m]) if fit is None else fit.p_c_in_w_m[:2]
 
 
 def _prior(

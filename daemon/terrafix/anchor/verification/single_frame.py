@@ -52,10 +52,9 @@ class ScoredMode:
 @dataclass(frozen=True)
 class SingleFramePlace:
     """``fix``: pose by the patches; None: they do not give the evidence for one, and the place is that of the mode,
-    with the heading of ``view``."""
+    with the heading of its view."""
 
-    mode: Mode
-    view: View
+    best: ScoredMode
     fix: PatchFix | None
 
 
@@ -99,4 +98,4 @@ def localize_single_frame(
     fix = None
     if evidence(best.sigmas) >= TRACK_LLR_MAX and best.place.fix.pnp.fit is not None:
         fix = verifier.refine(image, best.view, best.place.fix)
-    return SingleFramePlace(mode, best.view, fix if fix is not None and fix.pnp.fit is not None else None)
+    return SingleFramePlace(best, fix if fix is not None and fix.pnp.fit is not None else None)
