@@ -33,7 +33,7 @@ MAX_MODES = 8
 PATCH_LLR_SLOPE = DEFAULT_NULL.frame.count / DEFAULT_NULL.frame.excess
 # Nats of the best place over the mean of the others where all are wrong.
 # [measured: docs/decisions/072-correlation-and-patches-in-one-score.md]
-EXCESS_NULL = Tail(above=5.7, share=0.1, count=36.0, excess=28.2)
+EXCESS_NULL = Tail(above=5.6, share=0.1, count=68.0, excess=61.8)
 LIKELIHOOD_RATIO = float(np.exp(TRACK_LLR_MAX))  # factor on the mass of the accepted mode [spec: exp(TRACK_LLR_MAX)]
 
 
