@@ -368,7 +368,7 @@ class Localizer:
         )
         if place is None:
             return pose
-        mode = place.best.mode
+        mode = place.mode
         assert pose.match.place is not None
         there = MatchPlace(e_m=mode.e_m, n_m=mode.n_m, mass=pose.match.place.mass)
         match = msgspec.structs.replace(pose.match, place=there)
@@ -376,7 +376,7 @@ class Localizer:
             match = pose_match(match, place.fix, view)
         if match.verdict is not Verdict.ACCEPTED:
             scale = seen.correlation.scale_at(mode.e_m, mode.n_m)
-            turned = replace(view, r_w_c=place.best.view.r_w_c)
+            turned = replace(view, r_w_c=place.view.r_w_c)
             match = mode_match(match, mode, belief.cell_m, turned, scale, alone=True)
         return PoseResult(match, mode, attempted=True, likelihood_ratio=LIKELIHOOD_RATIO)
 

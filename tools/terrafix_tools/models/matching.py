@@ -221,8 +221,8 @@ def _place(
     placed = localize_single_frame(image, view, found, modes, matcher, math.log(FALSE_ALARMS))
     if placed is None:
         return None
-    fit = None if placed.fix is None else placed.best.place.fix.pnp.fit
-    return np.array([placed.best.mode.e_m, placed.best.mode.n_m]) if fit is None else fit.p_c_in_w_m[:2]
+    fit = None if placed.fix is None else placed.place.fix.pnp.fit
+    return np.array([placed.mode.e_m, placed.mode.n_m]) if fit is None else fit.p_c_in_w_m[:2]
 
 
 def _prior(

@@ -8,7 +8,7 @@ null model, ground of this map as this frame sees it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,52 +26,29 @@ from terrafix.core.node import Image
 from terrafix.map.null_model import DEFAULT_NULL, Tail
 
 # Modes that are compared, about 50 ms each. Of twelve, the last four hold the right place in 1 % of the frames.
-# [measured: docs/decisions/072-correlation-and-patches-in-one-score.md]
+# [measured: docs/decisions/072-single-frames-in-one-score.md]
 MAX_MODES = 8
 # Nats per standard deviation of the patches: decay of the tail of wrong places, as ``BELIEF_LLR_SLOPE`` of the
 # correlation. [spec: DEFAULT_NULL.frame]
 PATCH_LLR_SLOPE = DEFAULT_NULL.frame.count / DEFAULT_NULL.frame.excess
 # Nats of the best place over the mean of the others where all are wrong.
-# [measured: docs/decisions/072-correlation-and-patches-in-one-score.md]
+# [measured: docs/decisions/072-single-frames-in-one-score.md]
 EXCESS_NULL = Tail(above=5.6, share=0.1, count=68.0, excess=61.8)
 LIKELIHOOD_RATIO = float(np.exp(TRACK_LLR_MAX))  # factor on the mass of the accepted mode [spec: exp(TRACK_LLR_MAX)]
 
 
 @dataclass(frozen=True)
 class ScoredMode:
-    """``score``: nats of correlation and patches, up to a constant; ``sigmas``: of the patches alone, above the default
-    null model; ``view``: camera at the mode, with the yaw and scale that fit best there."""
+    """``view``: camera at the mode, with the yaw and scale that fit best there; ``sigmas``: of its patches above the
+    default null model; ``score``: nats of correlation and patches. ``fix``: refined pose by the patches of a selected
+    mode; None: they do not give the evidence for one."""
 
     mode: Mode
     view: View
     place: VerifiedPlace
     sigmas: float
     score: float
-
-
-@dataclass(frozen=True)
-class SingleFramePlace:
-    """``fix``: pose by the patches; None: they do not give the evidence for one, and the place is that of the mode,
-    with the heading of its view."""
-
-    best: ScoredMode
-    fix: PatchFix | None
-
-
-def scored_modes(
-    image: Image, view: View, correlation: CorrelationResult, modes: Sequence[Mode], verifier: PlaceVerifier
-) -> list[ScoredMode]:
-    """Those of ``modes`` with enough patches on the map, the highest score first."""
-    scored = []
-    for mode in modes:
-        hypothesis, z = correlation.best_at(mode.e_m, mode.n_m)
-        there = view_at(view, hypothesis, mode.e_m, mode.n_m)
-        place = verifier.verify(image, there, FINE_PLACE_CELL_PER_AGL)
-        if place is not None:
-            sigmas = PatchNull().sigmas(place.consensus, fine=True)
-            score = BELIEF_LLR_SLOPE * z + PATCH_LLR_SLOPE * sigmas
-            scored.append(ScoredMode(mode, there, place, sigmas, score))
-    return sorted(scored, key=lambda one: -one.score)
+    fix: PatchFix | None = None
 
 
 def localize_single_frame(
@@ -81,21 +58,27 @@ def localize_single_frame(
     modes: Sequence[Mode],
     matcher: FrameMatcher,
     log_probability: float,
-) -> SingleFramePlace | None:
+) -> ScoredMode | None:
     """``modes``: of the belief after this frame's correlation; ``log_probability``: allowed false-alarm probability of
-    this frame. None: no place, or more than one."""
-    verifier = PlaceVerifier(matcher)
-    scored = scored_modes(image, view, correlation, modes, verifier)
-    if not scored:
+    this frame. -> the selected mode; None: no place, or more than one."""
+    verifier, scored = PlaceVerifier(matcher), list[ScoredMode]()
+    for mode in modes:
+        hypothesis, z = correlation.best_at(mode.e_m, mode.n_m)
+        there = view_at(view, hypothesis, mode.e_m, mode.n_m)
+        if (place := verifier.verify(image, there, FINE_PLACE_CELL_PER_AGL)) is not None:
+            sigmas = PatchNull().sigmas(place.consensus, fine=True)
+            score = BELIEF_LLR_SLOPE * z + PATCH_LLR_SLOPE * sigmas
+            scored.append(ScoredMode(mode, there, place, sigmas, score))
+    best = max(scored, key=lambda one: one.score, default=None)
+    if best is None:
         return None
-    best, mode = scored[0], scored[0].mode
     near_m = NEIGHBOUR_RADIUS * view.agl_m  # within this distance the patches match the same place
-    rivals = [s.score for s in scored if np.hypot(s.mode.e_m - mode.e_m, s.mode.n_m - mode.n_m) > near_m]
+    rivals = [s.score for s in scored if np.hypot(s.view.e_m - best.view.e_m, s.view.n_m - best.view.n_m) > near_m]
     if not rivals or best.score < max(rivals) + DECISION_MARGIN:
         return None
     if best.score < np.mean(rivals) + EXCESS_NULL.exceedance_value(log_probability):
         return None
-    fix = None
-    if evidence(best.sigmas) >= TRACK_LLR_MAX and best.place.fix.pnp.fit is not None:
-        fix = verifier.refine(image, best.view, best.place.fix)
-    return SingleFramePlace(best, fix if fix is not None and fix.pnp.fit is not None else None)
+    if evidence(best.sigmas) < TRACK_LLR_MAX or best.place.fix.pnp.fit is None:
+        return best
+    fix = verifier.refine(image, best.view, best.place.fix)
+    return best if fix is None or fix.pnp.fit is None else replace(best, fix=fix)

@@ -17,7 +17,7 @@ from terrafix.anchor.matching.frame_matcher import (
 from terrafix.anchor.matching.match_message import ground_cov_m2
 from terrafix.anchor.matching.point_mass_filter import Belief, Mode
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.verification.single_frame import ScoredMode, SingleFramePlace, localize_single_frame
+from terrafix.anchor.verification.single_frame import ScoredMode, localize_single_frame
 from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.geodesy import local_rotation_up, rot_from_quat
 from terrafix.map.null_model import FalseAlarmBudget
@@ -50,7 +50,7 @@ def selected_mode(
     if found is None:
         return None
     assert found.fix is not None and found.fix.pnp.fit is not None
-    return found.best.mode, found.fix.pnp.fit.p_c_in_w_m
+    return found.mode, found.fix.pnp.fit.p_c_in_w_m
 
 
 def test_the_patches_select_the_right_mode(ground: np.ndarray) -> None:
@@ -77,8 +77,8 @@ def test_a_clear_correlation_selects_a_mode_that_patches_do_not_confirm(ground: 
         FrameMatcher(PINHOLE, source, GradientDescriber()),
         SHARE,
     )
-    assert found is not None and found.best.mode is clear and found.fix is None
-    assert np.allclose(found.best.view.r_w_c, local_rotation_up(0.1) @ R)
+    assert found is not None and found.mode is clear and found.fix is None
+    assert np.allclose(found.view.r_w_c, local_rotation_up(0.1) @ R)
 
 
 def test_a_place_without_a_pose_is_published_as_one_that_earlier_frames_have_no_part_in(
@@ -89,7 +89,7 @@ def test_a_place_without_a_pose_is_published_as_one_that_earlier_frames_have_no_
     unused: Any = None
     monkeypatch.setattr(
         "terrafix.anchor.localizer.localize_single_frame",
-        lambda *of: SingleFramePlace(ScoredMode(mode(*TRUE_M[:2]), turned, unused, 0.0, 0.0), None),
+        lambda *of: ScoredMode(mode(*TRUE_M[:2]), turned, unused, 0.0, 0.0),
     )
     package: Any = SingleMapPackage(ground)
     frames = MemoryFrameStore(2)
