@@ -12,7 +12,7 @@ CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
 LINES = {"daemon": 41424, "engines": 1672, "tools": 64306, "tests": 69596}
-WORDS = 65687  # of all documents
+WORDS = 65691  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 
