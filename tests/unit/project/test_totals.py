@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[3]
 CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
-LINES = {"daemon": 41391, "engines": 1672, "tools": 64314, "tests": 69559}
-WORDS = 65186  # of all documents
+LINES = {"daemon": 41404, "engines": 1672, "tools": 64314, "tests": 69562}
+WORDS = 65604  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 
