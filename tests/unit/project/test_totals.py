@@ -12,7 +12,7 @@ CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
 LINES = {"daemon": 41404, "engines": 1672, "tools": 64314, "tests": 69562}
-WORDS = 65621
+WORDS = 65641
 README_LINES, CHANGELOG_LINES = 150, 60
 
 
