@@ -339,7 +339,7 @@ class Localizer:
         footprint_m = max(result.footprint_m for result in results.values())
         new = min(self._since_observation_m / (NEW_GROUND_SHARE * footprint_m), 1.0)
         weight = max(new, MIN_OBSERVATION_WEIGHT)
-        used, correlation = layers.select(results, belief.mode(), weight)
+        used, correlation = layers.select(results, belief, weight)
         return Observation(image, view, used, correlation, new, weight, footprint_m)
 
     @staticmethod

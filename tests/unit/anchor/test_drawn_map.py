@@ -25,18 +25,36 @@ class DrawnMap(SingleMapPackage):
     )
 
 
-def started_on(ground: np.ndarray, start_sigma_m: float) -> tuple[AnchorNode, MemoryFrameStore]:
-    package: Any = DrawnMap(ground)
+class BesideOldImagery(SingleMapPackage):
+    """Imagery of ground that has been rebuilt, and the drawn layer of today's."""
+
+    manifest = SimpleNamespace(layers=(*SingleMapPackage.manifest.layers, *DrawnMap.manifest.layers))
+
+    def bind(self, _frame: object, layer: str) -> SingleMapPackage:
+        return DrawnMap(self._ground) if layer == "drawn" else SingleMapPackage(self._ground[::-1, ::-1].copy())
+
+
+def started_on(
+    ground: np.ndarray, start_sigma_m: float, kind: type[SingleMapPackage] = DrawnMap
+) -> tuple[AnchorNode, MemoryFrameStore]:
+    package: Any = kind(ground)
     frames = MemoryFrameStore(8)
     node = AnchorNode(frames, package, GradientDescriber(), 1.0)
     assert list(node.on(msgspec.structs.replace(ORIGIN, start_sigma_m=start_sigma_m))) == []
     return node, frames
 
 
-def flown(ground: np.ndarray, sigma_m: float, count: int = FRAMES, *, mirrored: bool = False) -> list[MapMatch]:
+def flown(
+    ground: np.ndarray,
+    sigma_m: float,
+    count: int = FRAMES,
+    *,
+    mirrored: bool = False,
+    kind: type[SingleMapPackage] = DrawnMap,
+) -> list[MapMatch]:
     """-> matches of a flight to the east through the middle of the map, predicted without an error. ``sigma_m``: of the
     start."""
-    node, frames = started_on(ground, sigma_m)
+    node, frames = started_on(ground, sigma_m, kind)
     matches = []
     for i in range(count):
         at_m = TRUE_M + np.array([(i - FRAMES / 2) * STEP_M, 0.0, 0.0])
@@ -59,6 +77,12 @@ def test_a_match_on_a_drawn_map_is_a_position_alone(ground: np.ndarray) -> None:
     assert last.verdict is Verdict.ACCEPTED and last.position_only and last.matches == [] and last.inliers == 0
     assert (last.matcher, last.on_drawn) == ("gradient on vectors", True)
     assert last.map_sigma_m == pytest.approx(6.0 / 2.146, abs=0.001) and error_m(last, 2) < 3.0
+
+
+def test_the_first_frame_over_rebuilt_ground_is_placed_by_the_drawn_layer(ground: np.ndarray) -> None:
+    (match,) = flown(ground, 10.0, 1, kind=BesideOldImagery)
+    assert match.on_drawn and match.place is not None
+    assert np.hypot(match.place.e_m - (TRUE_M[0] - FRAMES / 2 * STEP_M), match.place.n_m - TRUE_M[1]) < 4.0
 
 
 @pytest.mark.slow

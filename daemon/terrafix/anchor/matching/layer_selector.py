@@ -25,28 +25,24 @@ POOR_SCORE = 2.0
 
 class LayerSelector:
     """``tables``: names of the layers, the initial one first (``LocalMap.layers`` has the newest first).
-    ``last_resort``: one of them that is tried only where the best one is poor or has no data: its score may be higher,
-    and its matches say less.
 
     Call ``layers_to_correlate`` before a frame and ``update`` with the scores after it.
     """
 
-    def __init__(self, tables: Sequence[str], last_resort: str | None = None) -> None:
+    def __init__(self, tables: Sequence[str]) -> None:
         self.best = tables[0]
-        self._last_resort = last_resort
         self._others = {table: _Difference() for table in tables[1:]}
         self._since_pair = 0.0
         self._poor = False
 
     def layers_to_correlate(self) -> tuple[str, ...]:
         """Layers to correlate with the next frame: the best one, from time to time a second one."""
-        others = {name: one for name, one in self._others.items() if self._poor or name != self._last_resort}
-        if not others:
+        if not self._others:
             return (self.best,)
-        table, least = min(others.items(), key=lambda item: item[1].weight_sum)  # ties: the first one
+        table, least = min(self._others.items(), key=lambda item: item[1].weight_sum)  # ties: the first one
         due = least.weight_sum < MIN_LAYER_PAIRS or self._poor or self._since_pair >= PROBE_INTERVAL
         if due and least.weight_sum >= MIN_LAYER_PAIRS:  # all have enough pairs: the one that was tried longest ago
-            table = max(others, key=lambda name: others[name].age)
+            table = max(self._others, key=lambda name: self._others[name].age)
         return (self.best, table) if due else (self.best,)
 
     def update(self, scores: Mapping[str, float | None], weight: float) -> str | None:

@@ -1,5 +1,7 @@
 """The layers of a map: one bound map and one matcher per date, and the selection of the layer in use."""
 
+import copy
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -7,7 +9,7 @@ from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, De
 from terrafix.anchor.matching.descriptor_store import MAX_TILES, DescriptorStore
 from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher, View
 from terrafix.anchor.matching.layer_selector import LayerSelector
-from terrafix.anchor.matching.point_mass_filter import Belief, Mode
+from terrafix.anchor.matching.point_mass_filter import Belief
 from terrafix.anchor.place_index.recognizer import PlaceMemory, PlaceRecognizer
 from terrafix.anchor.verification.consensus_pose import ConsensusPose
 from terrafix.core.camera import CameraCalibration, Readout
@@ -72,7 +74,9 @@ class MapLayers:
             self._all[layer.table] = MapLayer(
                 bound, matcher, ConsensusPose(matcher), sigma_m, layer.null_model, recognizer, layer.is_drawn
             )
-        self._selector = LayerSelector([layer.table for layer in layers], DRAWN_TABLE)
+        tables = [layer.table for layer in layers]
+        self._drawn = DRAWN_TABLE if tables[0] != DRAWN_TABLE and DRAWN_TABLE in tables else None  # beside imagery
+        self._selector = LayerSelector([table for table in tables if table != self._drawn])
 
     def set_lens(self, radial_k1: float, readout: Readout | None) -> None:
         """Sets the distortion of the division model in all matchers, from the estimator's self-calibration, and the
@@ -85,23 +89,36 @@ class MapLayers:
         return self._all[self._selector.best]
 
     def correlate(self, image: Image, view: View, belief: Belief) -> dict[str, CorrelationResult]:
-        """Correlation with the layer in use, first, and from time to time with a second one."""
-        return {
+        """Correlation with the layer in use, first, and from time to time with a second one. With the drawn layer where
+        the first one is evidence against the belief."""
+        results = {
             table: self._all[table].matcher.correlate(image, view, belief)
             for table in self._selector.layers_to_correlate()
         }
+        if self._drawn and _evidence(results[self._selector.best], belief) < 0.0:
+            results[self._drawn] = self._all[self._drawn].matcher.correlate(image, view, belief)
+        return results
 
     def select(
-        self, results: dict[str, CorrelationResult], mode: Mode, weight: float
+        self, results: dict[str, CorrelationResult], belief: Belief, weight: float
     ) -> tuple[MapLayer, CorrelationResult]:
-        """The layer to use for this frame, with its result. ``mode``: mode of the belief before the correlation, so
-        that no layer is scored at its own maximum; ``weight``: share of new ground."""
+        """The layer to use for this frame, with its result. ``belief``: before the correlation, so that no layer is
+        scored at its own maximum; ``weight``: share of new ground."""
+        mode = belief.mode()
         scores = {
             table: result.best_at(mode.e_m, mode.n_m)[1] if result.verdict is Verdict.ACCEPTED else None
             for table, result in results.items()
+            if table != self._drawn
         }
         used = self._selector.update(scores, weight) or next(iter(results))
+        if self._drawn in results and _evidence(results[self._drawn], belief) > _evidence(results[used], belief):
+            used = self._drawn
         return self._all[used], results[used]
+
+
+def _evidence(result: CorrelationResult, belief: Belief) -> float:
+    """[nats] That ``Belief.update`` would return for a full observation; minus infinity without a correlation."""
+    return copy.copy(belief).update(result.surfaces, 1.0) if result.verdict is Verdict.ACCEPTED else -math.inf
 
 
 def _file_identity(package: MapPackage) -> str:

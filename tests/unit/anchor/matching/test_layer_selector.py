@@ -29,27 +29,6 @@ def test_a_single_layer_is_never_compared() -> None:
     assert fly(selector, {"imagery": 1.0}, 50) == [1] * 50 and selector.best == "imagery"
 
 
-def test_a_last_resort_is_not_tried_while_the_best_layer_fits() -> None:
-    selector = LayerSelector(["imagery", "drawn"], "drawn")
-    scores = [selector.layers_to_correlate() for _ in range(50) if selector.update({"imagery": 2.1}, 1.0)]
-    assert scores == [("imagery",)] * 50
-
-
-@pytest.mark.parametrize(
-    ("imagery", "drawn", "best"), [(1.0, 4.0, "drawn"), (1.0, 0.5, "imagery"), (None, 4.0, "imagery")]
-)
-def test_a_last_resort_is_used_where_the_best_layer_is_poor_or_has_no_data(
-    imagery: float | None, drawn: float, best: str
-) -> None:
-    selector = LayerSelector(["imagery", "drawn"], "drawn")
-    assert selector.layers_to_correlate() == ("imagery",)
-    used = [selector.update({"imagery": imagery}, 1.0)]
-    for _ in range(6):
-        assert set(selector.layers_to_correlate()) == {"imagery", "drawn"} or selector.best == "drawn"
-        used.append(selector.update({"imagery": imagery, "drawn": drawn}, 1.0))
-    assert selector.best == best and used[-1] == ("drawn" if imagery is None else best)
-
-
 @pytest.mark.parametrize("seed", range(10))
 def test_the_best_layer_is_selected_and_stays_selected(seed: int) -> None:
     selector = LayerSelector(["new", "old", "oldest"])
