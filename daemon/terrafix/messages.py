@@ -416,6 +416,8 @@ class MapMatch(Message, frozen=True, kw_only=True):
     belief: BeliefSummary | None = None  # None: the frame was not correlated around the believed position
     ground: GroundPlane | None = None  # None: no DEM
     search: SearchResult = SearchResult()
+    # Scale of the image's x axis over that of its y axis, where the map shows that it is not 1
+    aspect_ratio: float | None = None
 
     @property
     def position_only(self) -> bool:

@@ -20,7 +20,7 @@ from terrafix.anchor.frame_pose import (
     with_belief,
 )
 from terrafix.anchor.matching.descriptor_cache import Describer
-from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, View, view_at
+from terrafix.anchor.matching.frame_matcher import AS_PREDICTED, Hypothesis, View, view_at
 from terrafix.anchor.matching.layer_selector import POOR_SCORE
 from terrafix.anchor.matching.map_layers import MapLayer, MapLayers
 from terrafix.anchor.matching.match_message import mode_match, pose_match
@@ -45,6 +45,7 @@ from terrafix.anchor.relocalization.relocalizer import (
     unknown_sigma_m,
 )
 from terrafix.anchor.verification.converged_place import PlaceTest
+from terrafix.anchor.verification.image_shape import STRETCHES, ImageShape
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
 from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
 from terrafix.core.camera import CameraCalibration, Readout
@@ -110,6 +111,7 @@ class Localizer:
         self._single_frame_budget = FalseAlarmBudget()
         self._place_test: PlaceTest | None = None  # while a drawn map is searched
         self._place_budget = FalseAlarmBudget()
+        self._shape = ImageShape()
         self._since_observation_m = np.inf  # motion since the last observation
         self._since_single_frame_m = np.inf  # motion since a place was last sought by the patches of one frame
         self._scale_matched = False  # the last frame had a pose at the predicted scale
@@ -238,6 +240,7 @@ class Localizer:
             verdict=verdict,
             matcher=self._describer.name,
             search=SearchResult(sigma_m=self._relocalizer.sigma_m),
+            aspect_ratio=self._shape.ratio,
         )
 
     def skipped(self, prediction: Prediction, verdict: Verdict) -> MapMatch:
@@ -287,6 +290,7 @@ class Localizer:
         hypothesis, score = seen.correlation.best_at(modes[0].e_m, modes[0].n_m)
         self._widen_if_poor(belief, score, seen.weight)
         match = with_belief(match, belief, modes, score)
+        self._test_shape(seen, belief, hypothesis, score)
         found = self._place_test is not None
         if self._place_test is not None:
             passed = self._has_passed(self._place_test, modes[0], seen, score, evidence_nats)
@@ -306,9 +310,9 @@ class Localizer:
         refuted = self._relocalizer.refutes_place(image, mode_view)
         # Mixture "believed position, or anywhere": the variance that the second component adds.
         wrong = max(self._lock_monitor.wrong_probability, self._relocalizer.wrong_probability)
-        self._relocalizer.sigma_m = mixed_sigma_m(wrong, best.map)
+        self._relocalizer.sigma_m = float(np.hypot(mixed_sigma_m(wrong, best.map), self._shape.sigma_m(view.agl_m)))
         search = SearchResult(sigma_m=self._relocalizer.sigma_m, relocalized=found)
-        match = msgspec.structs.replace(pose.match, search=search)
+        match = msgspec.structs.replace(pose.match, search=search, aspect_ratio=self._shape.ratio)
         if self._lock_monitor.lost or refuted:
             around_m = None if refuted else prediction.p_c_in_w_m[:2]
             self._start_search(seen.layer if seen.layer.drawn else best, prediction.agl_m, around_m, LOST_SIGMA_M)
@@ -325,6 +329,14 @@ class Localizer:
         matched, self._scale_matched = self._scale_matched, False
         is_same_ground = self._since_observation_m < NEW_GROUND_SHARE * view.agl_m
         return replace(view, scale_sigma=0.0) if matched and is_same_ground else view
+
+    def _test_shape(self, seen: Observation, belief: Belief, hypothesis: Hypothesis, score: float) -> None:
+        """Updates the posterior of another shape of the images. ``hypothesis``, ``score``: of the best mode."""
+        if seen.layer.drawn or not self._shape.is_in_doubt(score):
+            return
+        scores = seen.layer.matcher.stretched_scores(seen.image, seen.view, belief, hypothesis, STRETCHES)
+        if len(scores) == len(STRETCHES):
+            self._shape.add(scores, seen.weight)
 
     @staticmethod
     def _has_passed(test: PlaceTest, mode: Mode, seen: Observation, score: float, evidence_nats: float) -> bool:

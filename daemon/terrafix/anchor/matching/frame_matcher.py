@@ -105,8 +105,11 @@ class SearchWindow(Protocol):
 
 @dataclass(frozen=True)
 class Hypothesis:
+    """Relative to a ``View``. ``stretch``: focal lengths in x and y over the described ones."""
+
     yaw_rad: float
     scale: float
+    stretch: tuple[float, float] = (1.0, 1.0)
 
 
 AS_PREDICTED = Hypothesis(0.0, 1.0)  # the zero hypothesis [spec: identity]
@@ -139,9 +142,13 @@ class CorrelationResult:
 
     def best_hypotheses(self, count: int) -> tuple[Hypothesis, ...]:
         """The ``count`` hypotheses with the highest standardised correlation anywhere, in their order."""
-        scores = [float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in self.surfaces]
-        chosen = sorted(np.argsort(scores)[-count:].tolist())
+        chosen = sorted(np.argsort(self.scores)[-count:].tolist())
         return tuple(self.hypotheses[i] for i in chosen)
+
+    @property
+    def scores(self) -> list[float]:
+        """The highest standardised correlation of each hypothesis."""
+        return [float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in self.surfaces]
 
     def scale_at(self, e_m: float, n_m: float) -> tuple[float, float] | None:
         """Scale of the height measured at a camera position, as (mean, variance), from the likelihoods of the scales
@@ -249,10 +256,29 @@ class FrameMatcher:
         """Orthorectified frames, one per hypothesis; None where the camera sees no ground."""
         blurred: dict[float, Image] = {}
         relief = self.relief(view)
+        turned = [view_at(view, one, view.e_m, view.n_m) for one in hypotheses]
         return [
-            rectify(image, self.camera, turned.r_w_c, turned.agl_m, gsd_m, stride, blurred, relief)
-            for turned in (view_at(view, one, view.e_m, view.n_m) for one in hypotheses)
+            rectify(image, self._stretched(one.stretch), at.r_w_c, at.agl_m, gsd_m, stride, blurred, relief)
+            for one, at in zip(hypotheses, turned, strict=True)
         ]
+
+    def _stretched(self, stretch: tuple[float, float]) -> CameraCalibration:
+        return replace(self.camera, fx=stretch[0] * self.camera.fx, fy=stretch[1] * self.camera.fy)
+
+    def stretched_scores(
+        self,
+        image: Image,
+        view: View,
+        belief: SearchWindow,
+        hypothesis: Hypothesis,
+        stretches: Sequence[tuple[float, float]],
+    ) -> dict[tuple[float, float], float]:
+        """-> highest standardised correlation in the search window of the image with each of ``stretches`` that sees
+        ground; empty: the window has no map data."""
+        cells = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
+        hypotheses = tuple(replace(hypothesis, stretch=stretch) for stretch in stretches)
+        found = self.correlate_on(without_colour(image, self.gradients), view, belief, hypotheses, *cells)
+        return {one.stretch: score for one, score in zip(found.hypotheses, found.scores, strict=True)}
 
     def correlate(self, image: Image, view: View, belief: SearchWindow) -> CorrelationResult:
         """Correlation surfaces over the search window, one per yaw and scale hypothesis within the uncertainty of

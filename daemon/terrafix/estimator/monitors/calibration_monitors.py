@@ -151,6 +151,7 @@ class Monitors:
     def on_map_match(self, match: MapMatch, telemetry: Telemetry, *, accepted: bool) -> None:
         """``accepted``: the match has entered the graph. Rejected poses are used as well, because one whose height is
         off is rarely accepted."""
+        self._shape.by_map = match.aspect_ratio
         if match.ground is not None and self._origin.ground_amsl_m is not None:
             self._rise_m = match.ground.amsl_m - self._origin.ground_amsl_m
         pose = match.verdict is Verdict.ACCEPTED and not match.position_only
@@ -212,7 +213,7 @@ class Monitors:
             factor = float(orientation.turned_deg) if orientation.quantity == "picture turned" else None
             found[orientation.quantity] = Finding(factor, orientation.detail)
         if (ratio := self._shape.ratio) is not None:
-            detail = "the ground changes its shape in turns as if the two axes of the image had different scales"
+            detail = "the ground has the shape that it has in images whose two axes have different scales"
             found["aspect ratio"] = Finding(ratio, f"{detail}: crop the images instead of scaling them, or set fx")
         if self._levelling.fault:
             found["attitude"] = Finding(None, f"{self._levelling.fault}: images that are levelled by it do not agree")

@@ -30,12 +30,14 @@ class ShapeMonitor:
         limit = threshold(COMPARISONS_PER_HOUR, len(ASPECT_RATIOS))
         self._tests = {ratio: Cusum(limit) for ratio in ASPECT_RATIOS}
         self._misfits = dict.fromkeys(ASPECT_RATIOS, 0.0)  # squared residuals: select among active ratios
+        self.by_map: float | None = None  # of the newest correlation with the map (anchor/verification/image_shape.py)
 
     @property
     def ratio(self) -> float | None:
-        """The ratio with the smallest misfit among those whose alarm is active; None: none is."""
+        """The ratio with the smallest misfit among those whose alarm is active; that by the map; None: there is
+        none."""
         active = [ratio for ratio, test in self._tests.items() if test.active]
-        return min(active, key=self._misfits.__getitem__, default=None)
+        return min(active, key=self._misfits.__getitem__, default=self.by_map)
 
     def add(self, pairs: np.ndarray, before: Attitude, now: Attitude, r_b_c: np.ndarray) -> None:
         """``pairs`` (N, 4) of a keyframe and a frame, their attitudes, and R_b_c (3x3)."""

@@ -139,6 +139,24 @@ def test_a_flight_whose_images_are_squeezed_names_it_and_withdraws_the_position(
     assert sigma_m(run.estimate(49)) >= FAULT_SIGMA_M
 
 
+def test_a_ratio_of_the_axes_that_the_map_shows_is_a_fault_until_it_shows_none() -> None:
+    flight, monitors, telemetry, changes = (
+        Flight(20, fix_every=1),
+        Monitors(ORIGIN),
+        Telemetry(),
+        list[CalibrationFault](),
+    )
+    for i in range(3):
+        match = msgspec.structs.replace(flight.fix(i), aspect_ratio=0.8 if i == 1 else None)
+        monitors.on_map_match(match, telemetry, accepted=True)
+        changes += monitors.take_changes(t_ns(i))
+        assert (monitors.sigma_m > 0.0) is (i == 1)
+    assert [(c.quantity, c.factor, c.active) for c in changes] == [
+        ("aspect ratio", 0.8, True),
+        ("aspect ratio", 0.8, False),
+    ]
+
+
 def _scaled_x(odometry: Odometry, factor: float) -> Odometry:
     pairs = [(factor * a, b, factor * c, d) for a, b, c, d in odometry.two_view]
     return msgspec.structs.replace(odometry, two_view=pairs)

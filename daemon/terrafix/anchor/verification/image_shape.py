@@ -1,0 +1,75 @@
+"""Whether both axes of the images have the scale of the camera description: a pipeline that scales 16:9 into 4:3, or
+crops 3:2, has stretched one of them.
+
+The map decides. A frame is correlated as described, with both axes larger and smaller, and with either axis alone. The
+patches of a single frame cannot tell: those that agree with one camera pose lie where the shapes agree."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_MAX, BELIEF_LLR_SLOPE
+from terrafix.core.agreement import STATED, Agreement, Cause, Range
+
+# Scale of a stretched axis. [spec: 4:3, 3:2 and 16:9 differ by 1.19 and 1.33; a correlation tolerates a tenth]
+STRETCH = 1.25
+Stretch = tuple[float, float]  # focal lengths in x and y over the described ones
+# Height and focal length of a description may be wrong as well: both axes are. [spec: geometry]
+SAME_SHAPE: tuple[Stretch, ...] = ((1.0, 1.0), (STRETCH, STRETCH), (1.0 / STRETCH, 1.0 / STRETCH))
+# By the scale of the x axis over that of the y axis. [spec: geometry]
+OTHER_SHAPES: dict[float, tuple[Stretch, ...]] = {
+    STRETCH: ((STRETCH, 1.0), (1.0, 1.0 / STRETCH)),
+    1.0 / STRETCH: ((1.0, STRETCH), (1.0 / STRETCH, 1.0)),
+}
+STRETCHES = (*SAME_SHAPE, *(one for shapes in OTHER_SHAPES.values() for one in shapes))
+# Standard deviations by which another shape has to fit better: the lead of the best of some wrong ones, where no shape
+# fits. [measured: docs/decisions/059-images-against-inertial-sensors.md]
+LEAD = 0.5
+# Largest score of 98 % of the wrong places: a frame that scores less may have another shape than those before it.
+DOUBTFUL_SCORE = 4.1  # [measured: anchor/matching/point_mass_filter.py]
+CERTAIN = math.log(1000.0)  # nats, for and against [spec: one in a thousand]
+# Share of the height: error of a position by an image with one axis stretched. [spec: of what is seen a height away]
+STRETCHED_SHARE = STRETCH - 1.0
+
+
+class ImageShape:
+    """Posterior of another shape, one for each ratio of the axes. ``ratio``: that of the images, x over y, while it is
+    certain that it is not 1; else None."""
+
+    def __init__(self) -> None:
+        limits = {Cause.DESCRIPTION: Range(STATED.prior, -CERTAIN, CERTAIN)}
+        self._agreements = {ratio: Agreement(limits) for ratio in OTHER_SHAPES}
+        self._tested = False
+        self.ratio: float | None = None
+
+    def is_in_doubt(self, score: float) -> bool:
+        """Whether a frame with this standardised correlation, as described, is to be tested."""
+        return score < DOUBTFUL_SCORE or any(odds > -CERTAIN for odds in self._log_odds.values())
+
+    def add(self, scores: Mapping[Stretch, float], weight: float) -> None:
+        """``scores``: highest standardised correlation of a frame with each of STRETCHES; ``weight``: 0..1, as in
+        ``Belief.update``."""
+        self._tested = True
+        as_described = max(scores[one] for one in SAME_SHAPE)
+        for ratio, shapes in OTHER_SHAPES.items():
+            nats = BELIEF_LLR_SLOPE * (max(scores[one] for one in shapes) - as_described - LEAD)
+            bounded = float(np.clip(nats, -BELIEF_LLR_MAX, BELIEF_LLR_MAX))
+            self._agreements[ratio].add(Cause.DESCRIPTION, weight * bounded)
+        ratio, log_odds = max(self._log_odds.items(), key=lambda item: item[1])
+        if log_odds >= CERTAIN:
+            self.ratio = ratio
+        elif log_odds < 0.0:
+            self.ratio = None
+
+    def sigma_m(self, agl_m: float) -> float:
+        """1-sigma per axis [m] that the mixture component of another shape adds to a position ``agl_m`` above
+        ground; 0 before a frame was tested: a drawn map shows no shape."""
+        if not self._tested:
+            return 0.0
+        probability = max(one.weight(Cause.DESCRIPTION) for one in self._agreements.values())
+        return math.sqrt(probability) * STRETCHED_SHARE * agl_m
+
+    @property
+    def _log_odds(self) -> dict[float, float]:
+        return {ratio: one.log_odds[Cause.DESCRIPTION] for ratio, one in self._agreements.items()}
