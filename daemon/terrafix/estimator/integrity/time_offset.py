@@ -388,7 +388,8 @@ class TimeOffset:
         self._compared = min(self._compared + 1.0, NOISE_MEMORY)
         learnt += (likely2 - learnt) / self._compared
         self._gyro_bias += density @ residual / span_s / self._compared
-        shrunk2 = (mean + gain * (residual - mean)) ** 2
+        # Relief between the two frames may look like a rotation that the gyroscopes do not have at any offset.
+        shrunk2 = np.minimum((mean + gain * (residual - mean)) ** 2, GATE[1] * variance)
         nu = DEGREES_OF_FREEDOM
         return np.asarray(-0.5 * (nu + 1.0) * np.log1p(shrunk2 / (nu * variance)).sum(axis=1))
 

@@ -1,5 +1,7 @@
 """Time offset between frames and telemetry, from the attitude that both observe."""
 
+import itertools
+
 import msgspec
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from simulated_flight import CAMERA, ORIGIN, PLACE, EstimatorRun, Flight, cov_of
 from terrafix.core.camera import Mount
 from terrafix.core.gate import GATE
 from terrafix.core.geodesy import LocalFrame
+from terrafix.core.pose import exp_so3
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.offset_drift import DRIFT_GRID_S, RATES, Hazards, predicted
 from terrafix.estimator.integrity.time_offset import MAX_SLEW, Contradiction, TimeOffset
@@ -71,6 +74,33 @@ def offset_of(flight: InertialFlight, until_s: float = 1e9) -> TimeOffset:
 def test_a_camera_in_time_is_not_corrected_and_not_claimed_wider(seed: int) -> None:
     offset = offset_of(InertialFlight(seed, 60, 25))
     assert offset.applied_s == 0.0 and offset.sigma_s <= STAMP_SIGMA_S
+
+
+def over_relief(odometry: Odometry, rng: np.random.Generator) -> Odometry:
+    """Images that turn about level axes as no gyroscope does, by six degrees a second."""
+    if not odometry.two_view:
+        return odometry
+    pairs, span_s = np.array(odometry.two_view), 0.2 * (odometry.frame_id - odometry.keyframe_id)
+    turned_deg = np.array([2.0, 6.0, 0.0]) * span_s + rng.normal(0.0, 0.5, 3)
+    rays = np.column_stack([pairs[:, 2:], np.ones(len(pairs))]) @ exp_so3(np.radians(turned_deg)).T
+    moved = np.column_stack([pairs[:, :2], rays[:, :2] / rays[:, 2:]])
+    return msgspec.structs.replace(odometry, two_view=moved.tolist())
+
+
+@pytest.mark.parametrize("seed", [2, 3, 7])
+def test_turns_of_images_that_the_gyroscopes_have_at_no_offset_say_nothing_of_it(seed: int) -> None:
+    flight, rng = InertialFlight(seed, 30, 25), np.random.default_rng([seed, 3])
+    telemetry, offset, sigmas_s = Telemetry(), TimeOffset(R_B_C), list[float]()
+    for message in itertools.chain.from_iterable(flight.messages_by_frame):
+        if isinstance(message, VehicleState):
+            telemetry.add(message)
+        elif isinstance(message, Imu):
+            telemetry.add_imu(message)
+        elif isinstance(message, Odometry):
+            offset.add(over_relief(message, rng), telemetry, 120.0)
+            offset.step(0.5)
+            sigmas_s.append(offset.sigma_s)
+    assert offset.applied_s == 0.0 and max(sigmas_s) < 0.2
 
 
 def test_an_offset_that_grows_is_followed(plane: InertialFlight) -> None:
