@@ -50,7 +50,8 @@ class OtherGround:
             or np.hypot(*(at_m - self._nothing_at_m)) >= REGISTRATION_SPACING_HEIGHTS * height_m
         ):
             self._nothing_at_m = at_m
-            self.agreement.add(Cause.OTHER_GROUND, math.log(P_NOTHING_OTHER_GROUND / p_nothing))
+            # A hit rate below that over other ground is one of other ground.
+            self.agreement.add(Cause.OTHER_GROUND, max(math.log(P_NOTHING_OTHER_GROUND / p_nothing), 0.0))
 
     def on_pose(self, information_share: float, position: Innovation, height_m: float) -> None:
         """A camera pose that was fused, weighted by the share 0..1 of the ground in it that is new. ``position``: the

@@ -115,7 +115,7 @@ def test_ground_that_shows_nothing_widens_no_claim_and_makes_the_first_pose_of_a
     assert known.variance_m2 == 0.0
 
 
-@pytest.mark.parametrize(("p_nothing", "grows"), [(0.1, True), (0.8, False)])
+@pytest.mark.parametrize(("p_nothing", "grows"), [(0.1, True), (0.8, False), (0.95, False)])
 def test_ground_that_shows_nothing_counts_by_the_hit_rate_of_the_flight_and_once_a_place(
     p_nothing: float, *, grows: bool
 ) -> None:
