@@ -386,6 +386,17 @@ def test_odometry_corrects_the_velocity_at_the_end_of_the_increment() -> None:
     assert np.linalg.norm(gained[:3]) > 0.4 * np.linalg.norm(off_m)
 
 
+def test_a_velocity_that_follows_an_image_of_another_time_is_claimed_as_uncertain_as_it_has_moved() -> None:
+    """An image that jumps by 23 m in a second passes the gate of a vehicle that may brake with 4 g."""
+    increment = integrate_motion(1.0, None, (1.2, 1.2), 0.0, 12.0, 0.0, same_source=True)
+    known = np.diag([0.5**2] * 3 + [0.3**2] * (MOTION_SIZE - 3))
+    predicted_cov, odometry_cov = predict_covariance(increment, known), 0.5**2 * np.eye(3)
+    wider, left, gained = fuse_odometry_increment(increment, np.array([-23.0, 4.0, 0.0]), predicted_cov, odometry_cov)
+    assert np.linalg.norm(gained[:2]) > 20.0
+    assert gained[0] ** 2 < 4.0 * left[3, 3]
+    assert np.trace(wider.cov) > 10.0 * np.trace(increment.cov)
+
+
 # --- in flight ----------------------------------------------------------------------------------------------------
 
 
