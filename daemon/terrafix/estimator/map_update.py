@@ -17,6 +17,7 @@ from terrafix.estimator.integrity.fragments import STEP_SHARE, MapHitRate, Match
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_run import InnovationRun
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
+from terrafix.estimator.integrity.velocity_doubt import MOTION_TIMEOUT_S
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.map_pose import (
     FixedPose,
@@ -27,7 +28,6 @@ from terrafix.estimator.measurements.map_pose import (
 )
 from terrafix.estimator.models.motion_model import unknown_motion_cov
 from terrafix.estimator.monitors.image_orientation import OrientationMonitor
-from terrafix.estimator.propagation import MOTION_TIMEOUT_S
 from terrafix.estimator.state import HEIGHT, HORIZONTAL, MOTION_SIZE, TRANSLATION, UP, VELOCITY, NodeState
 from terrafix.messages import MapMatch, Verdict
 

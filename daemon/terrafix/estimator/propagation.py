@@ -1,7 +1,6 @@
 """From frame to frame: motion model, odometry, attitude and height become a new node of the graph and its factors."""
 
 import functools
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,7 +14,7 @@ from terrafix.estimator.graph.pose_graph import NewNode
 from terrafix.estimator.initialization import Initializer, ResetReason, TakeOffDetector, continue_from, start_at
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_gate import InnovationGate
-from terrafix.estimator.integrity.signed_innovations import RUN_SIZE, SignedInnovations
+from terrafix.estimator.integrity.velocity_doubt import KnownMotion, VelocityDoubt
 from terrafix.estimator.measurements.aid_source import AidSample, AidSource
 from terrafix.estimator.measurements.contract import fuse
 from terrafix.estimator.measurements.ekf_dead_reckoning import DeadReckoning, DeadReckoningAid
@@ -50,8 +49,6 @@ from terrafix.estimator.state import (
 )
 from terrafix.messages import CovarianceMode, Verdict
 
-MOTION_TIMEOUT_S = 5.0  # of a vehicle with inertial aiding alone [spec: EKF2_NOAID_TOUT of PX4]
-
 
 @dataclass(frozen=True)
 class PropagationResult:
@@ -75,23 +72,6 @@ class PropagationResult:
         return self.verdict is Verdict.ACCEPTED
 
 
-@dataclass(frozen=True)
-class _RefusedMotion:
-    """Impossible motions in a row: time of the first; ``inertial``: inertial readings contradict all of them."""
-
-    since_s: float
-    inertial: bool
-
-
-@dataclass(frozen=True)
-class _Motion:
-    """V (8,) at ``t_s``, with covariance (8, 8)."""
-
-    t_s: float
-    motion: np.ndarray
-    cov: np.ndarray
-
-
 class Propagation:
     """``advance`` with every frame, in order of time.
 
@@ -105,9 +85,7 @@ class Propagation:
         self._dead_reckoning = DeadReckoningAid(state)
         self._aids = (self._dead_reckoning, *(make_aid(state) for make_aid in AID_SOURCES))
         self._height_gate, self._heading_gate = InnovationGate("height"), InnovationGate("attitude")
-        self._motion_refused: _RefusedMotion | None = None
-        self._signed = SignedInnovations()  # of odometry that is fused
-        self._before = deque[_Motion](maxlen=RUN_SIZE)  # what each of these was predicted from, the newest first
+        self._doubt = VelocityDoubt()
 
     def advance(self, frame: FrameInput) -> PropagationResult:
         """A new node for ``frame``, or a new graph that begins with it."""
@@ -123,6 +101,8 @@ class Propagation:
         before = state.graph.state(state.graph.newest)
         increment = functools.cache(lambda: self._increment(frame, before, fused=True))
         odometry = self._odometry.gated(frame, before, increment)
+        if self._odometry.static_since_s == frame.t_s:
+            self._doubt.before_static = self._motion_of(before)
         rejected = self._gate_heading(frame, odometry, before)
         if rejected is not None and self._heading_gate.should_reinitialise and state.last_fix_s is None:
             return self._initialize(frame, ResetReason.HEADING_GATE, rejected)
@@ -202,22 +182,13 @@ class Propagation:
     ) -> PropagationResult | None:
         """A new graph at the predicted pose, where the present one would be overconfident. None: no reset is due."""
         state, frame, odometry, cov = self._state, predicted.frame, predicted.odometry, predicted.cov.copy()
-        self._note_refused_motion(odometry, frame.t_s)
-        if self._is_motion_timed_out(frame.t_s) and predicted.increment is not None:
-            assert self._motion_refused is not None
-            contradicted_s = frame.t_s - self._motion_refused.since_s + state.graph.since_newest_s(frame.t_s)
-            cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
-            cov[DELTA_P, DELTA_P] += unknown_motion_cov()[VELOCITY, VELOCITY] * contradicted_s**2
-            against = "inertial readings" if self._motion_refused.inertial else "velocity"
-            detail = f"odometry contradicts {against} for {MOTION_TIMEOUT_S:.0f} s"
-            reset = _reset_verdict(ResetReason.MOTION_TIMEOUT, detail)
-            inertial = self._motion_refused.inertial
-            self._motion_refused = None  # velocity is unknown from here on: the next one has its own time
-            if inertial:
-                state.contradicted_images.begin()
-            else:
-                state.contradicted_images.end()
-            return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=not inertial)
+        if self._has_fused_static(odometry) and predicted.increment is not None:
+            return self._reset_standstill(predicted, verdicts)
+        self._doubt.note(odometry.verdict, odometry.motion_innovation, frame.t_s)
+        # Images that are known to be turned or mirrored explain impossible motions.
+        timed_out = state.orientation.fault is None and self._doubt.is_timed_out(frame.t_s)
+        if timed_out and predicted.increment is not None:
+            return self._reset_unknown_velocity(predicted, verdicts)
         if self._is_velocity_wrong(predicted) and predicted.increment is not None:
             return self._reset_velocity(predicted, verdicts)
         if (off_mps := self._start_off_mps(predicted)) is not None:
@@ -232,29 +203,75 @@ class Propagation:
             return PropagationResult(Verdict.ACCEPTED, placed, predicted.step_m, sigma_m, verdicts=tuple(verdicts))
         return self._reset_yaw_gauge(predicted, verdicts)
 
+    def _reset_unknown_velocity(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
+        """A new graph where odometry has contradicted velocity for long."""
+        state, refused = self._state, self._doubt.refused
+        t_s, cov = predicted.frame.t_s, predicted.cov.copy()
+        assert refused is not None
+        contradicted_s = t_s - refused.since_s
+        unknown_s = contradicted_s + state.graph.since_newest_s(t_s)
+        cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
+        cov[DELTA_P, DELTA_P] += unknown_motion_cov()[VELOCITY, VELOCITY] * unknown_s**2
+        against = "inertial readings" if refused.inertial else "velocity"
+        reset = _reset_verdict(ResetReason.MOTION_TIMEOUT, f"odometry contradicts {against} for {contradicted_s:.0f} s")
+        self._doubt.on_unknown()
+        if refused.inertial:
+            state.contradicted_images.begin()
+        else:
+            state.contradicted_images.end()
+        return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=not refused.inertial)
+
     def _reset_velocity(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
         """A new graph where odometry has been to one side of the prediction for frames. Either of the two is wrong. The
         velocity before these frames, and inertial readings since, are believed, as far as the images may be right,
         until places confirm these; without such readings velocity is unknown."""
-        innovation, cov, motion = predicted.odometry.motion_innovation, predicted.cov.copy(), predicted.motion
+        innovation, (off_m, before) = predicted.odometry.motion_innovation, self._doubt.take_run()
         assert innovation is not None
-        off_m, before = self._signed.sum_m, self._before[self._signed.run - 1]
-        cov[HORIZONTAL, HORIZONTAL] += np.outer(off_m, off_m)
         if innovation.inertial:
-            since = self._increment(predicted.frame, predicted.before, fused=False, from_s=before.t_s)
-            _, motion = since.predict(predicted.p_m, before.motion, float(predicted.before.calibration[HEADING]))
-            cov[DELTA_MOTION, DELTA_MOTION] = predict_covariance(since, before.cov)[DELTA_MOTION, DELTA_MOTION]
-            off_mps = (predicted.motion - motion)[VELOCITY]
-            cov[DELTA_V, DELTA_V] += np.outer(off_mps, off_mps)
+            predicted = self._with_velocity_of(predicted, before)
             self._state.contradicted_images.begin()
         else:
-            cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
-        self._signed.forget()
-        self._before.clear()
+            predicted = replace(predicted, cov=predicted.cov.copy())
+            predicted.cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
+            self._doubt.on_unknown()
+        predicted.cov[HORIZONTAL, HORIZONTAL] += np.outer(off_m, off_m)
         detail = f"odometry was {np.hypot(*off_m):.0f} m to one side of the prediction"
         reset = _reset_verdict(ResetReason.VELOCITY, detail)
-        predicted = replace(predicted, cov=cov, motion=motion)
         return self._continue(predicted, [*verdicts, reset], confirmed=not innovation.inertial)
+
+    def _reset_standstill(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
+        """A new graph where images that are now known to be repeated have shown a standstill. The velocity before them
+        is believed, as far as the vehicle may have stopped; its way since then is not known."""
+        before = self._doubt.before_static
+        assert before is not None
+        self._doubt.before_static = None
+        moving = self._with_velocity_of(predicted, before)
+        way_m = (moving.motion - predicted.motion)[VELOCITY][HORIZONTAL] * (predicted.frame.t_s - before.t_s)
+        moving.cov[HORIZONTAL, HORIZONTAL] += np.outer(way_m, way_m)
+        detail = f"repeated images have shown a standstill for up to {np.hypot(*way_m):.0f} m"
+        return self._continue(moving, [*verdicts, _reset_verdict(ResetReason.VELOCITY, detail)])
+
+    def _with_velocity_of(self, predicted: PredictedFrame, before: KnownMotion) -> PredictedFrame:
+        """``predicted`` with the velocity of ``before`` and what the motion model has of the time since then; it is as
+        uncertain as it differs from the predicted one."""
+        cov = predicted.cov.copy()
+        since = self._increment(predicted.frame, predicted.before, fused=False, from_s=before.t_s)
+        _, motion = since.predict(predicted.p_m, before.motion, float(predicted.before.calibration[HEADING]))
+        cov[DELTA_MOTION, DELTA_MOTION] = predict_covariance(since, before.cov)[DELTA_MOTION, DELTA_MOTION]
+        off_mps = (predicted.motion - motion)[VELOCITY]
+        cov[DELTA_V, DELTA_V] += np.outer(off_mps, off_mps)
+        return replace(predicted, cov=cov, motion=motion)
+
+    def _motion_of(self, newest: NodeState) -> KnownMotion:
+        """Of the newest node."""
+        return KnownMotion(self._state.graph.time_of(self._state.graph.newest), newest.motion, self._state.motion_cov)
+
+    def _has_fused_static(self, odometry: GatedOdometry) -> bool:
+        """Whether frames that show one view are known to be repeated with this one, and some of them are fused."""
+        since_s = self._odometry.static_since_s
+        if odometry.verdict is not Verdict.STALLED or since_s is None or self._doubt.before_static is None:
+            return False
+        return self._state.last_fused_s >= since_s
 
     def _start_off_mps(self, predicted: PredictedFrame) -> np.ndarray | None:
         if self._state.last_fix_s is not None:  # the map tells where it started
@@ -357,6 +374,7 @@ class Propagation:
         last = state.refresh_newest()
         if fused is not None:
             state.last_fused_s = frame.t_s
+            self._doubt.on_fused(frame.t_s - dt_s)
             state.speed_prior.update(frame.t_s, last.velocity_mps, last.velocity_cov)
             for aid in self._aids:
                 aid.after_frame(last, frame.attitude)
@@ -460,34 +478,11 @@ class Propagation:
         return self._height_gate.rejection(innovation, self._state.last_fix_s)
 
     def _is_velocity_wrong(self, predicted: PredictedFrame) -> bool:
-        """Whether the innovations of odometry have kept one sign for so long that velocity is what is wrong."""
-        odometry, graph = predicted.odometry, self._state.graph
+        odometry = predicted.odometry
         innovation = odometry.motion_innovation
         if odometry.fused is None or innovation is None or odometry.begins_disconnected:
             return False
-        cov_m2 = innovation.cov_m2[HORIZONTAL, HORIZONTAL]
-        self._signed.add(innovation.residual_m[HORIZONTAL], cov_m2, inertial=innovation.inertial)
-        self._before.appendleft(_Motion(graph.time_of(graph.newest), predicted.before.motion, self._state.motion_cov))
-        return self._signed.alarm
-
-    def _note_refused_motion(self, odometry: GatedOdometry, t_s: float) -> None:
-        innovation = odometry.motion_innovation
-        if odometry.verdict is Verdict.UNCONFIRMED:  # two frames close together allow what a longer time does not
-            return
-        if odometry.verdict is not Verdict.IMPLAUSIBLE:
-            self._motion_refused = None
-        elif self._motion_refused is None:
-            self._motion_refused = _RefusedMotion(t_s, innovation is not None and innovation.inertial)
-        elif innovation is not None and not innovation.inertial:
-            self._motion_refused = replace(self._motion_refused, inertial=False)
-
-    def _is_motion_timed_out(self, t_s: float) -> bool:
-        """Whether impossible motions have gone on for so long that velocity may be what is wrong; not while images that
-        are known to be turned or mirrored explain them."""
-        refused = self._motion_refused
-        return (
-            refused is not None and t_s - refused.since_s >= MOTION_TIMEOUT_S and self._state.orientation.fault is None
-        )
+        return self._doubt.is_to_one_side(innovation, self._motion_of(predicted.before))
 
     # --- dead reckoning of the autopilot ---------------------------------------------------------------------------
 
@@ -515,6 +510,7 @@ class Propagation:
     ) -> PropagationResult:
         """``rejected``: verdict that led to it, if the reason is a gate."""
         state = self._state
+        self._doubt.on_unknown()
         self._height_gate.accept_initial()
         self._heading_gate.accept_initial()
         placed, initial = self._initializer.initialize(state, frame)

@@ -12,11 +12,11 @@ from simulated_flight import FRAME_S, ORIGIN, EstimatorRun, Flight, blind, cov_o
 from terrafix.estimator.filter_state import FilterState
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import MAX_STATIC_S
+from terrafix.estimator.integrity.velocity_doubt import MOTION_TIMEOUT_S
 from terrafix.estimator.measurements.height import is_below_map_matching
 from terrafix.estimator.measurements.odometry import KeyframeMotion, OdometryMeasurement
 from terrafix.estimator.measurements.telemetry_buffer import Attitude
 from terrafix.estimator.models.motion_model import MAX_SPEED_SIGMA_MPS
-from terrafix.estimator.propagation import MOTION_TIMEOUT_S
 from terrafix.messages import MapMatch, Message, Odometry, Prediction, VehicleState, Verdict
 
 FIRST, END, FRAMES = 30, 42, 70  # frames of the false pictures, of the flight
@@ -218,6 +218,17 @@ def test_no_prediction_is_published_for_a_frozen_picture(frozen_run: tuple[Fligh
     assert predicted >= {FIRST - 1, *range(END, FRAMES)}
 
 
+def test_the_standstill_that_the_first_repeated_pictures_have_shown_is_not_believed() -> None:
+    """A slow vehicle without inertial readings could have stopped: the first of them is fused."""
+    flight = Flight(FRAMES, seed=8, speed_mps=8.0)
+    listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
+    assert listener.verdicts("odometry")[FIRST].verdict is Verdict.ACCEPTED
+    assert resets(listener) == {0: STARTED, FIRST + 1: "repeated images have shown a standstill for up to 7 m"}
+    assert max(mahalanobis(listener, flight, i) for i in range(FIRST, FRAMES)) < 3.0
+    velocity_mps = np.array(listener.estimate(END - 1).velocity_enu_mps)[:2]
+    assert float(np.hypot(*velocity_mps)) > 4.0
+
+
 @pytest.mark.parametrize("found", [True, False])
 def test_a_frozen_camera_is_detected_without_a_heading(found: bool) -> None:
     """``found``: a map match has given the heading. Else no motion is predicted, and the duration decides."""
@@ -308,6 +319,16 @@ def test_contradicted_velocity_is_reset_once_after_the_timeout(speed_mps: float,
     assert verdicts[timeout + 1].verdict is then
 
 
+def test_a_velocity_that_one_motion_has_shown_is_reset_as_soon_as_as_many_contradict_it() -> None:
+    """The first motion of a flight is believed: nothing predicts it."""
+    flight, fast = Flight(FRAMES, seed=8), Flight(FRAMES, seed=8, speed_mps=55.0)
+    listener = EstimatorRun().fly(flight, 0, 1)
+    for i in range(1, 6):
+        odometry = odometry_of((fast if i == 1 else flight).messages(i))
+        listener.feed([*without(flight.messages(i), Odometry, MapMatch), odometry])
+    assert resets(listener) == {0: STARTED, 4: "odometry contradicts velocity for 1 s"}
+
+
 def test_a_coarse_match_does_not_join_a_fragment_to_the_flight() -> None:
     """It says what the belief remembers; pictures of another flight have no part in it."""
     flight = Flight(FRAMES, seed=5)
@@ -341,6 +362,16 @@ def test_an_estimate_too_low_is_reset_from_one_and_a_half_times_the_matching_lim
     state.terrain.update(plane(0.0), np.zeros(3))
     here = np.array([0.0, 0.0, 15.0])
     assert is_below_map_matching(state, Attitude(0.0, 0.0, 0.0, reported_m), here) == resets_it
+
+
+@pytest.mark.parametrize("reported_m", [None, 3.0])
+def test_an_estimate_below_the_ground_is_reset_whatever_height_is_reported(reported_m: float | None) -> None:
+    """Images seen from below the ground turn the sign of every motion."""
+    state = FilterState(msgspec.structs.replace(ORIGIN, ground_amsl_m=0.0))
+    state.terrain.update(plane(0.0), np.zeros(3))
+    attitude = Attitude(0.0, 0.0, 0.0, reported_m)
+    assert is_below_map_matching(state, attitude, np.array([0.0, 0.0, -1.0]))
+    assert not is_below_map_matching(state, attitude, np.array([0.0, 0.0, 2.0]))
 
 
 def test_a_height_too_low_for_matching_is_reset_to_the_reported_one() -> None:

@@ -243,7 +243,7 @@ def test_inertial_readings_go_on_from_the_velocity_before_the_images_that_contra
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """That velocity is shifted by 10 m/s, to be recognised; the claim contains that of the images, too."""
-    add, led, motion = SignedInnovations.add, list[int](), propagation._Motion
+    add, led, motion = SignedInnovations.add, list[int](), propagation.KnownMotion
 
     def counted(odometry: Odometry, rng: np.random.Generator) -> Odometry:
         seen.append(odometry.frame_id)
@@ -259,7 +259,7 @@ def test_inertial_readings_go_on_from_the_velocity_before_the_images_that_contra
 
     seen = list[int]()
     monkeypatch.setattr(SignedInnovations, "add", alarm_after)
-    monkeypatch.setattr(propagation, "_Motion", shifted)
+    monkeypatch.setattr(propagation, "KnownMotion", shifted)
     result = flown(1, counted, lambda _: None, FIRST + 12)
     after = {e.frame_id: (e, off) for (e, _), off in zip(result.estimates, result.velocity_off_mps, strict=True)}
     assert after[led[LED - 2]][1] < 0.2 * SHIFT_MPS

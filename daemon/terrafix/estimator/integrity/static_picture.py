@@ -48,7 +48,7 @@ class StaticPicture:
     """State of the current run of static images."""
 
     def __init__(self) -> None:
-        self._since_s: float | None = None
+        self.since_s: float | None = None  # time of the first static image of the run; None: the view has changed
         self._attitude: Attitude | None = None  # at the first static image
         self._frozen = False
 
@@ -63,12 +63,12 @@ class StaticPicture:
         ``static``: the frame shows the view of the frame before. ``is_moving``: by velocity or inertial readings the
         vehicle cannot stand still."""
         if not static or attitude.stands:
-            self._since_s, self._attitude, self._frozen = None, None, False
+            self.since_s, self._attitude, self._frozen = None, None, False
             return False
-        if self._since_s is None or self._attitude is None:
-            self._since_s, self._attitude = t_s, attitude
+        if self.since_s is None or self._attitude is None:
+            self.since_s, self._attitude = t_s, attitude
         has_tilted = _tilt_change_rad(self._attitude, attitude) > MIN_TILT_CHANGE_RAD
-        self._frozen = self._frozen or is_moving or has_tilted or t_s - self._since_s >= MAX_STATIC_S
+        self._frozen = self._frozen or is_moving or has_tilted or t_s - self.since_s >= MAX_STATIC_S
         return self._frozen
 
 

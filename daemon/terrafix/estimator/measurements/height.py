@@ -38,6 +38,8 @@ def is_below_map_matching(state: FilterState, attitude: Attitude, p_m: np.ndarra
     """Whether the estimated height of a camera at ``p_m`` (3,) keeps the anchor from matching frames that would correct
     it: below the ground, or while the reported height, above ground that a map tells, would allow that."""
     agl_m = state.terrain.height_above_m(p_m)
-    if attitude.agl_m is None or attitude.stands or not state.terrain.has_dem or state.yaw_gauge is not None:
-        return agl_m < 0.0 and attitude.agl_m is None and not attitude.stands
+    if attitude.stands or agl_m < 0.0:
+        return not attitude.stands
+    if attitude.agl_m is None or not state.terrain.has_dem or state.yaw_gauge is not None:
+        return False
     return agl_m < MIN_MATCHING_AGL_M and reported_agl_m(state, attitude, p_m) > LOW_RATIO * MIN_MATCHING_AGL_M

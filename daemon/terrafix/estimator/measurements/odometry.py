@@ -75,6 +75,11 @@ class OdometryMeasurement:
         self._state = state
         self._static_picture, self._view_change = StaticPicture(), ViewChange()
 
+    @property
+    def static_since_s(self) -> float | None:
+        """Time of the first of the frames in a row that show one view; None: the newest one shows another."""
+        return self._static_picture.since_s
+
     def gated(self, frame: FrameInput, before: NodeState, increment: Callable[[], MotionIncrement]) -> GatedOdometry:
         """``before``: the newest node; ``increment()``: of the motion model, from there to the frame."""
         odometry, attitude, t_s = frame.odometry, frame.attitude, frame.t_s
