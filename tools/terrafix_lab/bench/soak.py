@@ -66,12 +66,14 @@ class Samples:
 
 
 def _memory_mb(pid: int) -> float:
-    """Proportional set size: pages that processes share are divided between them."""
+    """Proportional set size of anonymous and shared memory: pages that processes share are divided between them. Pages
+    of files are no growth: their share rises when another program that has mapped the same libraries ends."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
         return math.nan
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("Pss:")), math.nan)
+    kb = [int(line.split()[1]) for line in lines if line.startswith(("Pss_Anon:", "Pss_Shmem:"))]
+    return sum(kb) / 1024 if kb else math.nan
 
 
 def _open_files(pid: int) -> int:
