@@ -81,12 +81,14 @@ class MapUpdate:
         self._fixes = CorrelatedFixes()
         self._map_hit_rate = MapHitRate()
         self._newest_match_ns = -1
+        self._stretched = False  # matches of images with another shape have counted since the last one that is used
         self._rejected = InnovationRun()
         self._coarse = InnovationRun()  # coarse matches of a graph that does not know its position
 
     def apply(self, match: MapMatch) -> MapResult:
         """``match``: of a frame that ``Propagation.advance`` has had. It enters the graph at the node of that frame."""
         state = self._state
+        self._stretched = self._stretched or match.aspect_ratio is not None
         node = state.node_of.get(match.frame_id)
         if node is not None and not state.graph.holds(node):
             node = None
@@ -232,6 +234,9 @@ class MapUpdate:
         state.last_fix_s = self._fixes.newest_s
         state.on_placed()
         self.hypotheses.on_match_accepted()
+        if self._stretched and match.aspect_ratio is None:  # what those said of other places does not count
+            self._stretched = False
+            self.hypotheses.on_relocalized()
         self.map_sigma_m = match.map_sigma_m
         last = state.refresh_newest()
         state.speed_prior.update_by_map(last.t_s, last.velocity_mps, last.velocity_cov)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from inertial_flight import ORIGIN, InertialFlight
+from map_matches import position_of, with_pose
 from overloaded_flight import FRAME_EVERY, FRAME_S, sigma_m
 from overloaded_flight import OverloadedResult as LoadedFlown
 from seeds import seeds
-from simulated_flight import PLACE, EstimatorRun
+from simulated_flight import PLACE, EstimatorRun, Flight
+from simulated_flight import sigma_m as sigma_of
 from terrafix.core.limits import MAX_SENT_VELOCITY_SIGMA_MPS
 from terrafix.estimator import propagation
 from terrafix.estimator.integrity.signed_innovations import SignedInnovations
@@ -266,3 +268,20 @@ def test_inertial_readings_go_on_from_the_velocity_before_the_images_that_contra
     estimate, off_mps = after[led[LED - 1]]
     assert off_mps == pytest.approx(SHIFT_MPS, rel=0.2)
     assert estimate.velocity_sigma_mps == pytest.approx(SHIFT_MPS, rel=0.2)
+
+
+@pytest.mark.parametrize("ratio", [None, 0.8])
+def test_places_that_images_of_another_shape_have_shown_count_no_more_once_they_have_the_described_one(
+    ratio: float | None,
+) -> None:
+    """Two map matches that agree with each other, 40 m beside the position, and then right ones."""
+    flight, run = Flight(60, seed=5, fix_every=3), EstimatorRun().fly(Flight(60, seed=5, fix_every=3), 0, 30)
+    for i in range(30, 40):
+        messages = flight.messages(i)
+        if i < 36:
+            e_m, n_m, up_m = position_of(flight.fix(i))
+            match = with_pose(flight.fix(i), p_c_in_w_m=(e_m + 40.0, n_m, up_m))
+            shown = msgspec.structs.replace(match, aspect_ratio=ratio)
+            messages = [shown if isinstance(message, MapMatch) else message for message in messages]
+        run.feed(messages)
+    assert (sigma_of(run.estimate(39)) < 7.0) is (ratio is not None)
