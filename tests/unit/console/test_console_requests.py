@@ -31,6 +31,7 @@ from terrafix_tools.console.store.database import FILE
 from terrafix_tools.installation import install_command
 
 FORM = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"}
+AT_60 = {"lat": 60, "lon": 0}
 
 
 def assert_refused(answer: Answer, status: int, *words: str) -> None:
@@ -81,11 +82,9 @@ def test_a_flight_is_created_listed_read_and_deleted(console: Console) -> None:
         ({"name": "x" * 101}, "name"),
         ({"height_m": "high"}, "height_m"),
         ({"map": None, "area": {"waypoints": [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}]}}, "no map sources"),
-        # 2 degrees at 60 are 111.32 km: (111.32 + 19) * 19
-        (
-            {"map": None, "area": {"waypoints": [{"lat": 60, "lon": 0}, {"lat": 60, "lon": 2}], "corridor_m": 9500}},
-            "2476 km2",
-        ),
+        # A degree at 60 is 55.66 km: (5.5 * 55.66 + 40) * 40, and (9 * 55.66 + 40) * 40
+        ({"map": None, "area": {"waypoints": [AT_60, {**AT_60, "lon": 5.5}], "corridor_m": 20_000}}, "no map sources"),
+        ({"map": None, "area": {"waypoints": [AT_60, {**AT_60, "lon": 9}], "corridor_m": 20_000}}, "21,638 km2"),
     ],
 )
 def test_a_flight_that_is_not_valid_is_refused_with_the_field(
