@@ -13,7 +13,8 @@ import numpy as np
 from terrafix.core.pose import tangent_to_world
 from terrafix.estimator.covariances import Covariances
 from terrafix.estimator.graph.pose_graph import PoseGraph
-from terrafix.estimator.integrity.fragments import ContradictedImages, Fragment, Fragments
+from terrafix.estimator.integrity.contradicted_images import ContradictedImages
+from terrafix.estimator.integrity.fragments import Fragment, Fragments
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.yaw_gauge import YawGauge
 from terrafix.estimator.keyframe_store import KeptKeyframe, KeyframeStore

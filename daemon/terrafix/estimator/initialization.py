@@ -112,6 +112,7 @@ def start_at(
     cov[WORLD_ROTATION, WORLD_ROTATION] = np.diag([1.0, 1.0, UNKNOWN_RAD]) ** 2
     state.yaw_gauge = YawGauge(at_m) if attitude.yaw_rad is None else None
     motion_cov = stationary_motion_cov() if attitude.stands else unknown_motion_cov()
+    state.contradicted_images.inertial_cov = None
     node = NodeState(pose, bias, np.zeros(MOTION_SIZE))
     return _start(state, frame, node, (cov, calibration_cov, motion_cov), state.terrain.ground_m)
 

@@ -12,8 +12,9 @@ from terrafix.estimator.filter_state import FilterState, PastFrame
 from terrafix.estimator.graph.pose_graph import GraphPrior
 from terrafix.estimator.initialization import ResetReason, reset
 from terrafix.estimator.integrity.alternative_position import MIN_CONSISTENT
+from terrafix.estimator.integrity.contradicted_images import MatchedFrame
 from terrafix.estimator.integrity.correlated_fixes import CorrelatedFixes
-from terrafix.estimator.integrity.fragments import STEP_SHARE, MapHitRate, MatchedFrame
+from terrafix.estimator.integrity.fragments import STEP_SHARE, MapHitRate
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.innovation_run import InnovationRun
 from terrafix.estimator.integrity.position_hypotheses import PositionHypotheses
@@ -190,7 +191,8 @@ class MapUpdate:
         off = None if match.position_only else measurement.position_innovation(*predicted)
         contradicted = state.contradicted_images.active
         if not match.position_only:
-            self.hypotheses.other_ground.on_pose(share, position, height_m)
+            inliers = 0 if match.pose is not None else match.inliers
+            self.hypotheses.other_ground.on_pose(share, position, height_m, inliers)
             self._learn_from_pose(match, node, before, measurement)
         self._accept(match, fixed_s, here)
         state.covariances.record(node)

@@ -216,7 +216,7 @@ class Propagation:
         reset = _reset_verdict(ResetReason.MOTION_TIMEOUT, f"odometry contradicts {against} for {contradicted_s:.0f} s")
         self._doubt.on_unknown()
         if refused.inertial:
-            state.contradicted_images.begin()
+            state.contradicted_images.begin(predicted.cov[DELTA_MOTION, DELTA_MOTION])
         else:
             state.contradicted_images.end()
         return self._continue(replace(predicted, cov=cov), [*verdicts, reset], confirmed=not refused.inertial)
@@ -228,8 +228,8 @@ class Propagation:
         innovation, (off_m, before) = predicted.odometry.motion_innovation, self._doubt.take_run()
         assert innovation is not None
         if innovation.inertial:
-            predicted = self._with_velocity_of(predicted, before)
-            self._state.contradicted_images.begin()
+            predicted, inertial_cov = self._with_velocity_of(predicted, before)
+            self._state.contradicted_images.begin(inertial_cov)
         else:
             predicted = replace(predicted, cov=predicted.cov.copy())
             predicted.cov[DELTA_MOTION, DELTA_MOTION] = unknown_motion_cov()
@@ -245,22 +245,23 @@ class Propagation:
         before = self._doubt.before_static
         assert before is not None
         self._doubt.before_static = None
-        moving = self._with_velocity_of(predicted, before)
+        moving, _ = self._with_velocity_of(predicted, before)
         way_m = (moving.motion - predicted.motion)[VELOCITY][HORIZONTAL] * (predicted.frame.t_s - before.t_s)
         moving.cov[HORIZONTAL, HORIZONTAL] += np.outer(way_m, way_m)
         detail = f"repeated images have shown a standstill for up to {np.hypot(*way_m):.0f} m"
         return self._continue(moving, [*verdicts, _reset_verdict(ResetReason.VELOCITY, detail)])
 
-    def _with_velocity_of(self, predicted: PredictedFrame, before: KnownMotion) -> PredictedFrame:
+    def _with_velocity_of(self, predicted: PredictedFrame, before: KnownMotion) -> tuple[PredictedFrame, np.ndarray]:
         """``predicted`` with the velocity of ``before`` and what the motion model has of the time since then; it is as
-        uncertain as it differs from the predicted one."""
+        uncertain as it differs from the predicted one. And the covariance (8, 8) of V without this difference."""
         cov = predicted.cov.copy()
         since = self._increment(predicted.frame, predicted.before, fused=False, from_s=before.t_s)
         _, motion = since.predict(predicted.p_m, before.motion, float(predicted.before.calibration[HEADING]))
-        cov[DELTA_MOTION, DELTA_MOTION] = predict_covariance(since, before.cov)[DELTA_MOTION, DELTA_MOTION]
+        motion_cov = predict_covariance(since, before.cov)[DELTA_MOTION, DELTA_MOTION]
+        cov[DELTA_MOTION, DELTA_MOTION] = motion_cov
         off_mps = (predicted.motion - motion)[VELOCITY]
         cov[DELTA_V, DELTA_V] += np.outer(off_mps, off_mps)
-        return replace(predicted, cov=cov, motion=motion)
+        return replace(predicted, cov=cov, motion=motion), motion_cov
 
     def _motion_of(self, newest: NodeState) -> KnownMotion:
         """Of the newest node."""
@@ -367,6 +368,7 @@ class Propagation:
         walk, parent = self._walk_sigmas(registered), state.graph.state(registered.parent)
         node = state.graph.extend(frame.t_s, new)
         state.motion_cov = self._motion_cov(registered)
+        state.contradicted_images.propagate(increment)
         state.covariances.extended(new, parent, walk, state.motion_cov)
         self._continuity_of(predicted, node)
         state.register_frame(node, frame.frame_id, predicted.odometry.fragment)

@@ -25,7 +25,7 @@ from terrafix.messages import GimbalAttitude, Imu, ImuSample, VehicleState
 ALIGNABLE_S = 10.0  # of attitude in frames.csv, from which it is aligned with the log [spec: MIN_ATTITUDE_S]
 ANY_TIME_S = 86_400.0  # 1-sigma of the flight's zero on a log of which nothing is known [spec: a day]
 MAX_IMU_HZ = 50.0  # faster readings are averaged: what a companion requests [spec: RATES_HZ of simulated logs]
-IMU_BATCH = 5  # readings in one message: 0.1 s [spec: IMU_BATCH_NS of tlog.py]
+IMU_BATCH = 3  # readings in one message [spec: IMU_BATCH_NS at 50 Hz]
 ARMED, DISARMED = 10, 11  # EV.Id [spec: AP_Logger.h LogEvent]
 PX4_ARMED = 2  # vehicle_status.arming_state [spec: PX4 msg/VehicleStatus.msg]
 CAM, TRIG = "CAM", "TRIG"  # rows of ArduPilot: by the camera's signal where it has one; by the one that triggers it

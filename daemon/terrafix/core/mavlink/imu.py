@@ -9,6 +9,10 @@ IMU_MESSAGES = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU", "SCALED_IMU2")
 MAX_FORCE_MPS2 = 32.0 * STANDARD_GRAVITY_MPS2  # saturation of the 16-bit fields: milli-g ...
 MAX_RATE_RADPS = 32.0  # ... and milliradians per second
 MAX_BOOT_US = 10**14  # three years; a greater value is a UNIX time
+# Length of a batch of readings, live and from a log: at 33 Hz one or two readings per message. The estimate of a frame
+# does not wait for readings: a batch is shorter than the processing time of an image, and with the interval to the next
+# reading shorter than MAX_READING_GAP_NS. [tuned]
+IMU_BATCH_NS = 40_000_000
 
 Readings = tuple[float, float, float, float, float, float]
 

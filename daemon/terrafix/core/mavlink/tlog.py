@@ -18,7 +18,7 @@ from terrafix.core.mavlink import exposure, gimbal
 from terrafix.core.mavlink.airspeed import AirspeedReader
 from terrafix.core.mavlink.gimbal import GimbalReader
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
-from terrafix.core.mavlink.imu import MAX_BOOT_US, ImuStreamSelector, boot_ns, imu_readings
+from terrafix.core.mavlink.imu import IMU_BATCH_NS, MAX_BOOT_US, ImuStreamSelector, boot_ns, imu_readings
 from terrafix.core.mavlink.log_clock import Jump, repaired
 from terrafix.core.mavlink.log_records import address, payload, read_records, record, sequence
 from terrafix.core.mavlink.vehicles import ARMED_FLAG, AUTOPILOT_COMPONENT, HeardVehicle, choose_vehicle, firmware_of
@@ -26,7 +26,6 @@ from terrafix.messages import GimbalAttitude, Imu, ImuSample, VehicleState
 
 __all__ = ["TelemetryLog", "is_tlog", "read_imu", "read_tlog", "record"]
 
-LOG_IMU_BATCH_NS = 100_000_000  # duration of the samples in one Imu message
 CRC_EXTRA = {number: int(kind.crc_extra) for number, kind in mavlink.mavlink_map.items()}
 _STATES = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT,
@@ -336,7 +335,7 @@ def _batches(boot: list[_TimedReadings]) -> Iterator[Imu]:
     for i, (_, measured_ns, readings) in enumerate(boot):
         t_ns = measured_ns + offset_ns
         batch.append((t_ns, readings))
-        if t_ns - batch[0][0] >= LOG_IMU_BATCH_NS or i == len(boot) - 1:
+        if t_ns - batch[0][0] >= IMU_BATCH_NS or i == len(boot) - 1:
             samples: list[ImuSample] = [(t_ns - at_ns, *values) for at_ns, values in batch]  # type: ignore[misc]
             yield Imu(t_ns=t_ns, source="mavlink", samples=samples)
             batch = []

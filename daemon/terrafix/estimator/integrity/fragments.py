@@ -15,8 +15,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from terrafix.core.gate import CHI2_95, SIGMAS_95
-
 FOREIGN_SPEED_MPS = 30.0  # m/s: images of another flight move with up to this, in any direction [tuned]
 CONFIRM_LLR = 3.0  # nats per frame: 1 in 20 foreign motions is as close to the prediction by chance [tuned]
 CONSISTENT_D2 = 1.39  # squared Mahalanobis distance [spec: chi-square, 2 degrees of freedom, 50 %]
@@ -26,8 +24,6 @@ CONFIRM_FRAMES = 2  # consecutive frames with sufficient evidence [tuned]
 # A fragment of this duration [s] and length [frames] is confirmed without evidence, with the position covariance of
 # dead reckoning. Over ground that the map does not match, nothing else would confirm it. [tuned]
 CONFIRM_AFTER_S, CONFIRM_AFTER_FRAMES = 30.0, 20
-# Share of a way by which images that are squeezed, or of another focal length, tell it wrong.
-WRONG_SHARE = 0.25  # [spec: 16:9 in 4:3]
 STEP_SHARE = 0.04  # of a step: error of odometry over real ground, where nothing corrects it [tuned]
 
 
@@ -60,66 +56,18 @@ class Fragment:
         """A measurement has tied the fragment to the flight."""
         self.confirmed = self.joined = True
 
-    def add_frame(self, t_s: float, evidence: "MotionEvidence", *, only_by_place: bool = False) -> None:
-        """``evidence``: of the motion of the frame at ``t_s``. ``only_by_place``: neither motion nor duration confirms
-        the fragment, because images have contradicted inertial readings."""
+    def add_frame(self, t_s: float, evidence: "MotionEvidence | None", *, by_duration: bool = True) -> None:
+        """``evidence``: of the motion of the frame at ``t_s``; None: it says nothing of the flight. ``by_duration``:
+        False if images have contradicted inertial readings, which ends not because it lasts."""
         self.frames += 1
-        if only_by_place:
-            return
-        self.consistent_frames = self.consistent_frames + 1 if evidence.supports_same_flight(self.map_llr) else 0
+        supports = evidence is not None and evidence.supports_same_flight(self.map_llr)
+        self.consistent_frames = self.consistent_frames + 1 if supports else 0
         moves_as_predicted = self.consistent_frames >= CONFIRM_FRAMES
-        timed_out = t_s - self.start_s >= CONFIRM_AFTER_S and self.frames >= CONFIRM_AFTER_FRAMES
+        lasts = t_s - self.start_s >= CONFIRM_AFTER_S and self.frames >= CONFIRM_AFTER_FRAMES
+        timed_out = by_duration and lasts
         self.confirmed = self.confirmed or moves_as_predicted or timed_out
-        if moves_as_predicted and evidence.inertial:
+        if moves_as_predicted and evidence is not None and evidence.inertial:
             self.join()
-
-
-@dataclass(frozen=True)
-class MatchedFrame:
-    """A frame of ``fragment`` at ``t_s``, ``displacement_m`` (2,) by odometry from the first frame of the fragment.
-    ``position_m`` (2,), with covariance ``cov_m2`` (2, 2): of its map match, east and north."""
-
-    t_s: float
-    fragment: Fragment
-    displacement_m: np.ndarray
-    position_m: np.ndarray
-    cov_m2: np.ndarray
-
-
-@dataclass
-class ContradictedImages:
-    """Images have contradicted inertial readings (``active``): one of the two is wrong. A map match of such an image
-    gives a position, and says nothing of the motion that images show: a squeezed image is matched, and its odometry is
-    wrong by a quarter. So two map matches decide, by the way between them."""
-
-    active: bool = False
-    _first: MatchedFrame | None = None
-
-    def begin(self) -> None:
-        self.active, self._first = True, None
-
-    def end(self) -> None:
-        self.active, self._first = False, None
-
-    def on_map_match(self, frame: MatchedFrame) -> None:
-        """The images are right, and their fragment is joined, where odometry agrees with a way that is long enough to
-        tell, or for CONFIRM_AFTER_S: over one place nothing can tell."""
-        first = self._first
-        if first is None or first.fragment is not frame.fragment:
-            self._first = frame
-            return
-        way_m = frame.position_m - first.position_m
-        length_m = float(np.hypot(*way_m))
-        off_m = frame.displacement_m - first.displacement_m - way_m
-        cov_m2 = first.cov_m2 + frame.cov_m2 + (STEP_SHARE * length_m) ** 2 * np.eye(2)
-        if off_m @ np.linalg.solve(cov_m2, off_m) > CHI2_95:
-            self._first = frame
-        elif (
-            WRONG_SHARE * length_m > 2.0 * SIGMAS_95 * math.sqrt(np.linalg.eigvalsh(cov_m2)[-1])
-            or frame.t_s - first.t_s >= CONFIRM_AFTER_S
-        ):
-            frame.fragment.join()
-            self.end()
 
 
 class MapHitRate:
@@ -170,21 +118,25 @@ class MotionEvidence:
 
     ``residual_m`` (2,): horizontal motion by odometry less the predicted one, with covariance ``cov_m2`` (2, 2).
     ``dt_s``: duration of the motion. ``turns_agree``: the images turn as the reported heading does. ``inertial``: by
-    inertial readings, without a break since the last frame with fused odometry."""
+    inertial readings, without a break since the last frame with fused odometry. ``contradicted``: images have been
+    wrong before."""
 
     residual_m: np.ndarray
     cov_m2: np.ndarray
     dt_s: float
     turns_agree: bool = True
     inertial: bool = False
+    contradicted: bool = False
 
     def supports_same_flight(self, other_llr: float) -> bool:
         """Whether the evidence is sufficient, together with ``other_llr`` [nats] of other sources.
 
         Where velocity is so uncertain that no motion reaches CONFIRM_LLR, motion within the 50 % ellipse is sufficient:
-        foreign images are rare."""
-        required_llr = min(CONFIRM_LLR, self.max_llr - 0.5 * CONSISTENT_D2)
-        return self.turns_agree and self.llr + other_llr >= required_llr
+        foreign images are rare. Not so if they have been wrong; but what other sources have said since then, they have
+        said of those."""
+        if self.contradicted:
+            return self.turns_agree and self.llr >= CONFIRM_LLR
+        return self.turns_agree and self.llr + other_llr >= min(CONFIRM_LLR, self.max_llr - 0.5 * CONSISTENT_D2)
 
     @property
     def llr(self) -> float:

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from terrafix.core.geodesy import local_rotation_up
 from terrafix.estimator.factors.three_view import ThreeViewConstraint, ThreeViewPose, three_view_constraint
 from terrafix.estimator.filter_state import FilterState, FrameInput
-from terrafix.estimator.integrity.fragments import Fragment, MotionEvidence
+from terrafix.estimator.integrity.contradicted_images import WrongVelocity
+from terrafix.estimator.integrity.fragments import CONFIRM_LLR, Fragment, MotionEvidence
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
 from terrafix.estimator.integrity.motion_gate import MotionInnovation
 from terrafix.estimator.integrity.static_picture import StaticPicture, ViewChange
@@ -22,7 +24,17 @@ from terrafix.estimator.measurements.telemetry_buffer import UNKNOWN_ATTITUDE_RA
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.models.plane_motion import RelativePose
 from terrafix.estimator.monitors.image_orientation import ORIENTATIONS, Orientation
-from terrafix.estimator.state import HEADING, HEIGHT, RADIAL_K1, TRANSLATION, UP, VELOCITY, NodeState
+from terrafix.estimator.state import (
+    DELTA_P,
+    HEADING,
+    HEIGHT,
+    HORIZONTAL,
+    RADIAL_K1,
+    TRANSLATION,
+    UP,
+    VELOCITY,
+    NodeState,
+)
 from terrafix.messages import CovarianceMode, Odometry, Verdict
 
 # Verdicts on frames without a new view of the ground.
@@ -118,7 +130,7 @@ class OdometryMeasurement:
                 state.image_jump = None if frozen else (t_s, motion.horizontal)
                 return GatedOdometry(verdict, None, alone, innovation=innovation, motion_innovation=motion)
             if not fragment.confirmed:
-                self._weigh_fragment(fragment, frame, answer, before, motion)
+                self._weigh_fragment(fragment, frame, answer, before, motion, increment())
         verdict = Verdict.ACCEPTED if fragment.confirmed else Verdict.UNCONFIRMED
         fragment.displacement_m = in_fragment_m
         disconnected = fragment.confirmed and not was_confirmed and not fragment.joined
@@ -170,14 +182,52 @@ class OdometryMeasurement:
         seen: KeyframeMotion,
         before: NodeState,
         innovation: MotionInnovation,
+        increment: MotionIncrement,
     ) -> None:
         """Whether motion and turn of a fragment that is not confirmed are those of this flight."""
-        over_s = max(frame.t_s - self._state.graph.time_of(seen.parent), 1e-3)
-        heading = heading_innovation(self._state, frame.attitude, seen.parent, seen.motion.r, before)
+        state = self._state
+        over_s = max(frame.t_s - state.graph.time_of(seen.parent), 1e-3)
+        heading = heading_innovation(state, frame.attitude, seen.parent, seen.motion.r, before)
         turns_agree = heading.mahalanobis2 <= HEADING_GATE**2
-        inertial = innovation.inertial and self._state.continuity.inertial_since_fused
-        evidence = MotionEvidence(innovation.residual_m[:2], innovation.cov_m2[:2, :2], over_s, turns_agree, inertial)
-        fragment.add_frame(frame.t_s, evidence, only_by_place=self._state.contradicted_images.active)
+        inertial = innovation.inertial and state.continuity.inertial_since_fused
+        cov_m2 = innovation.cov_m2[HORIZONTAL, HORIZONTAL]
+        evidence = MotionEvidence(innovation.residual_m[HORIZONTAL], cov_m2, over_s, turns_agree, inertial)
+        contradicted = state.contradicted_images
+        if not contradicted.active:
+            fragment.add_frame(frame.t_s, evidence)
+            return
+        fragment.add_frame(
+            frame.t_s, self._of_contradicted(evidence, frame, seen, before, increment), by_duration=False
+        )
+        if fragment.joined:
+            contradicted.end()
+
+    def _of_contradicted(
+        self,
+        evidence: MotionEvidence,
+        frame: FrameInput,
+        seen: KeyframeMotion,
+        before: NodeState,
+        increment: MotionIncrement,
+    ) -> MotionEvidence | None:
+        """``evidence`` of images that have contradicted inertial readings, by the velocity that these have had since
+        before. None: they do not know it, or the images are as wrong as before."""
+        contradicted = self._state.contradicted_images
+        if contradicted.inertial_cov is None:
+            return None
+        velocity_m2ps2 = contradicted.inertial_cov[VELOCITY, VELOCITY][HORIZONTAL, HORIZONTAL]
+        cov_m2 = self._innovation_cov(frame.t_s, seen, increment, contradicted.inertial_cov)[HORIZONTAL, HORIZONTAL]
+        noise_m2 = cov_m2 - velocity_m2ps2 * evidence.dt_s**2
+        yaw_rad = self._state.camera.yaw_rad(before.pose.rotation().matrix())
+        turn = local_rotation_up(yaw_rad)[HORIZONTAL, HORIZONTAL]
+        shown = WrongVelocity(
+            turn @ evidence.residual_m / evidence.dt_s,
+            turn @ noise_m2 @ turn.T / evidence.dt_s**2,
+            turn @ before.motion[VELOCITY][HORIZONTAL],
+        )
+        if contradicted.right_llr(shown, turn @ velocity_m2ps2 @ turn.T) < CONFIRM_LLR:
+            return None
+        return replace(evidence, cov_m2=cov_m2, contradicted=True)
 
     def three_view(self, seen: KeyframeMotion) -> tuple[int, ThreeViewConstraint] | None:
         """The constraint of points that the keyframe before, the keyframe and the frame saw, and the node of the
@@ -210,14 +260,21 @@ class OdometryMeasurement:
         """Innovation of a camera position ``p_m`` (3,) by odometry, against the motion model."""
         state = self._state
         predicted_m, _ = increment.predict(before.pose.translation(), before.motion, float(before.calibration[HEADING]))
+        cov_m2 = self._innovation_cov(t_s, seen, increment, state.motion_cov)
+        return MotionInnovation(p_m - predicted_m, cov_m2, state.graph.since_newest_s(t_s), increment.inertial)
+
+    def _innovation_cov(
+        self, t_s: float, seen: KeyframeMotion, increment: MotionIncrement, motion_cov: np.ndarray
+    ) -> np.ndarray:
+        """(3, 3) of ``_innovation``, world axes, with covariance ``motion_cov`` (8, 8) of V of the newest node."""
+        state = self._state
         dt_s = state.graph.since_newest_s(t_s)
-        cov_m2 = predict_covariance(increment, state.motion_cov)[:3, :3]
+        cov_m2 = predict_covariance(increment, motion_cov)[DELTA_P, DELTA_P].copy()
         if not state.fragments.of(seen.parent).confirmed:  # the motion model alone led here from the keyframe
             since_s = t_s - state.graph.time_of(seen.parent)
-            cov_m2 += state.motion_cov[VELOCITY, VELOCITY] * max(since_s**2 - dt_s**2, 0.0)
+            cov_m2 += motion_cov[VELOCITY, VELOCITY] * max(since_s**2 - dt_s**2, 0.0)
         r_w_c = state.graph.state(seen.parent).pose.rotation().matrix() @ seen.motion.r
-        seen_m2 = r_w_c @ seen.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T
-        return MotionInnovation(p_m - predicted_m, cov_m2 + seen_m2, dt_s, increment.inertial)
+        return np.asarray(cov_m2 + r_w_c @ seen.motion.cov[TRANSLATION, TRANSLATION] @ r_w_c.T)
 
     def links(self, seen: KeyframeMotion, frame: FrameInput) -> list[LinkMeasurement | FusionVerdict]:
         """The further keyframes of the frame, each with its motion or with the reason why there is none."""

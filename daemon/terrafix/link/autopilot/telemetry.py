@@ -13,7 +13,7 @@ from terrafix.core.mavlink.airspeed import AirspeedReader
 from terrafix.core.mavlink.exposure import exposure_of
 from terrafix.core.mavlink.gimbal import ATTITUDE_MESSAGES, GimbalReader
 from terrafix.core.mavlink.home_altitude import TakeOffHeight
-from terrafix.core.mavlink.imu import IMU_MESSAGES, ImuStreamSelector, boot_ns, imu_readings
+from terrafix.core.mavlink.imu import IMU_BATCH_NS, IMU_MESSAGES, ImuStreamSelector, boot_ns, imu_readings
 from terrafix.core.mavlink.vehicles import AUTOPILOT_COMPONENT
 from terrafix.link.admission.boot_clock import WRAP_MS
 from terrafix.link.admission.served_autopilot import is_autopilot_heartbeat
@@ -29,9 +29,6 @@ MAX_TRANSPORT_NS = 500_000_000  # a mapped time further from the time of arrival
 BOOT_WRAP_NS = WRAP_MS * NS_PER_MS
 MAX_ATTITUDE_RAD = 4 * math.pi  # larger angles fit no convention: the message is invalid [tuned]
 MAX_HEIGHT_M = 20_000.0  # larger heights are ignored [tuned]
-# Length of a batch of readings: at 33 Hz one or two readings per message. It is shorter than the processing time of an
-# image in vision, so that the estimate of a frame does not wait for readings. [tuned]
-LIVE_IMU_BATCH_NS = 40_000_000
 
 
 class TelemetryDecoder:
@@ -176,7 +173,7 @@ class TelemetryDecoder:
         if self._imu_batch and t_ns <= self._imu_batch[-1][0]:
             return None  # repeated, or the mapping of the clocks has just moved
         self._imu_batch.append((t_ns, readings))
-        if t_ns - self._imu_batch[0][0] < LIVE_IMU_BATCH_NS:
+        if t_ns - self._imu_batch[0][0] < IMU_BATCH_NS:
             return None
         samples: list[ImuSample] = [(t_ns - at_ns, *values) for at_ns, values in self._imu_batch]  # type: ignore[misc]
         self._imu_batch.clear()

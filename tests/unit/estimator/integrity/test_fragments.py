@@ -11,11 +11,9 @@ from terrafix.estimator.integrity.fragments import (
     CONFIRM_LLR,
     CONSISTENT_D2,
     FOREIGN_SPEED_MPS,
-    ContradictedImages,
     Fragment,
     Fragments,
     MapHitRate,
-    MatchedFrame,
     MotionEvidence,
 )
 
@@ -153,58 +151,20 @@ def test_fragment_and_displacement_are_stored_for_each_node() -> None:
         fragments.of(7)
 
 
-def test_images_that_contradicted_inertial_readings_are_confirmed_neither_by_motion_nor_by_duration() -> None:
+def test_images_that_contradicted_inertial_readings_are_not_confirmed_by_duration() -> None:
     fragment = Fragment(0.0)
-    evidence = MotionEvidence(np.zeros(2), 0.01 * np.eye(2), 1.0, inertial=True)
     for i in range(1, 100):
-        fragment.add_frame(float(i), evidence, only_by_place=True)
+        fragment.add_frame(float(i), None, by_duration=False)
     assert not fragment.confirmed and not fragment.joined
-    fragment.join()
-    assert fragment.confirmed
 
 
-def matched(
-    images: ContradictedImages, ways_m: list[float], scale: float, fragments: list[Fragment], *, every_s: float = 1.0
-) -> list[bool]:
-    """Whether the images are contradicted after each of the map matches at ``ways_m`` east of the first, good to 2 m,
-    where odometry shows a share ``scale`` of the way."""
-    active = []
-    for i, (way_m, fragment) in enumerate(zip(ways_m, fragments, strict=True)):
-        east = np.array([1.0, 0.0])
-        images.on_map_match(MatchedFrame(every_s * i, fragment, scale * way_m * east, way_m * east, 4.0 * np.eye(2)))
-        active.append(images.active)
-    return active
-
-
-def contradicted() -> tuple[ContradictedImages, Fragment]:
-    images = ContradictedImages()
-    images.begin()
-    return images, Fragment(0.0)
-
-
-def test_contradicted_images_are_right_again_where_they_agree_with_the_way_between_two_map_matches() -> None:
-    images, fragment = contradicted()
-    assert matched(images, [0.0, 40.0, 80.0, 120.0], 1.02, [fragment] * 4) == [True, True, True, False]
-    assert fragment.joined
-
-
-@pytest.mark.parametrize("scale", [0.75, 4.0 / 3.0])
-def test_squeezed_images_stay_contradicted_wherever_the_map_shows_them(scale: float) -> None:
-    images, fragment = contradicted()
-    assert all(matched(images, [20.0 * i for i in range(60)], scale, [fragment] * 60))
-    assert not fragment.confirmed
-    after = Fragment(0.0)
-    images.on_map_match(MatchedFrame(60.0, after, np.zeros(2), np.array([1200.0, 0.0]), np.eye(2)))
-    assert matched(images, [1260.0], 1.0, [after], every_s=0.0) == [True]  # another origin of its displacement
-
-
-def test_a_way_between_two_fragments_tells_nothing_of_the_images() -> None:
-    images, fragment = contradicted()
-    others = [fragment, Fragment(1.0), Fragment(2.0)]
-    assert matched(images, [0.0, 100.0, 200.0], 1.0, others) == [True, True, True]
-
-
-def test_over_one_place_contradicted_images_are_believed_again_after_the_time_that_confirms_a_fragment() -> None:
-    images, fragment = contradicted()
-    active = matched(images, [0.1 * i for i in range(32)], 1.0, [fragment] * 32)
-    assert active == [True] * 30 + [False] * 2
+@pytest.mark.parametrize(("sigma_m", "joined"), [(0.5, True), (8.0, False)])
+def test_contradicted_images_need_evidence_where_velocity_is_hardly_known(sigma_m: float, joined: bool) -> None:
+    """For those that nothing has contradicted motion within the 50 % ellipse is sufficient then."""
+    fragments = Fragment(0.0), Fragment(0.0)
+    for fragment, contradicted in zip(fragments, (False, True), strict=True):
+        fragment.map_llr = -2.5 if contradicted else 0.0  # said of wrong images
+        for i in range(1, CONFIRM_FRAMES + 1):
+            motion = replace(evidence(0.0, sigma_m), inertial=True, contradicted=contradicted)
+            fragment.add_frame(float(i), motion, by_duration=not contradicted)
+    assert [fragment.joined for fragment in fragments] == [True, joined]
