@@ -194,6 +194,8 @@ class MapUpdate:
             inliers = 0 if match.pose is not None else match.inliers
             self.hypotheses.other_ground.on_pose(share, position, height_m, inliers)
             self._learn_from_pose(match, node, before, measurement)
+            alone = replace(measurement, information_share=1.0)
+            self._weigh_fragment(node, levelled(alone, *predicted))
         self._accept(match, fixed_s, here)
         state.covariances.record(node)
         agree = contradicted and not state.contradicted_images.active
@@ -210,17 +212,16 @@ class MapUpdate:
         if self._fixes.newest_s is not None:
             new_m = self._fixes.new_ground_m(state.graph.time_of(node), here, math.inf)
             self.hypotheses.other.on_pose(new_m / height_m, _place_mass(match))
-        self._weigh_fragment(node, measurement)
 
-    def _weigh_fragment(self, node: int, measurement: MapPoseMeasurement) -> None:
+    def _weigh_fragment(self, node: int, placed: FixedPose) -> None:
         """A pose joins the fragment of its frame, unless its images have contradicted inertial readings: then the next
         one decides."""
         state = self._state
         fragment = state.fragments.of(node)
         if state.contradicted_images.active:
-            cov_m2 = tangent_to_world(measurement.cov, measurement.pose.rotation().matrix())[HORIZONTAL, HORIZONTAL]
+            cov_m2 = tangent_to_world(placed.cov, placed.pose.rotation().matrix())[HORIZONTAL, HORIZONTAL]
             t_s, displacement_m = state.graph.time_of(node), state.fragments.displacement_m(node)
-            matched = MatchedFrame(t_s, fragment, displacement_m, measurement.position_m, cov_m2)
+            matched = MatchedFrame(t_s, fragment, displacement_m, placed.pose.translation()[HORIZONTAL], cov_m2)
             state.contradicted_images.on_map_match(matched)
         else:
             fragment.join()

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from terrafix.core.gate import CHI2_95, SIGMAS_95
-from terrafix.estimator.integrity.fragments import CONFIRM_AFTER_S, STEP_SHARE, Fragment
+from terrafix.core.gate import CHI2_95
+from terrafix.estimator.integrity.fragments import CONFIRM_AFTER_S, CONFIRM_FRAMES, CONFIRM_LLR, STEP_SHARE, Fragment
 from terrafix.estimator.models.motion_model import MotionIncrement, predict_covariance
 from terrafix.estimator.state import ACCELERATIONS, DELTA_MOTION, DELTA_V, HORIZONTAL
 
@@ -112,12 +112,12 @@ class ContradictedImages:
         length_m = float(np.hypot(*way_m))
         off_m = frame.displacement_m - first.displacement_m - way_m
         cov_m2 = first.cov_m2 + frame.cov_m2 + (STEP_SHARE * length_m) ** 2 * np.eye(2)
+        wrong_m, away_m = WRONG_SHARE * length_m, float(np.hypot(*off_m))
+        # Of right images against those that are wrong by so much, in the direction in which they are off.
+        llr = 0.5 * wrong_m * (wrong_m - 2.0 * away_m) / float(np.linalg.eigvalsh(cov_m2)[-1])
         if off_m @ np.linalg.solve(cov_m2, off_m) > CHI2_95:
             self._first = frame
-        elif (
-            WRONG_SHARE * length_m > 2.0 * SIGMAS_95 * math.sqrt(np.linalg.eigvalsh(cov_m2)[-1])
-            or frame.t_s - first.t_s >= CONFIRM_AFTER_S
-        ):
+        elif llr >= CONFIRM_FRAMES * CONFIRM_LLR or frame.t_s - first.t_s >= CONFIRM_AFTER_S:
             frame.fragment.join()
             self.end()
 
