@@ -117,11 +117,14 @@ AS_PREDICTED = Hypothesis(0.0, 1.0)  # the zero hypothesis [spec: identity]
 
 @dataclass(frozen=True)
 class CorrelationResult:
+    """``evidence_nats``: that ``Belief.update`` returns for a full observation, where layers are compared by it."""
+
     verdict: Verdict
     surfaces: tuple[Surface, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
     footprint_m: float = 1.0
     cell_m: float = 1.0
+    evidence_nats: float = -math.inf
 
     def best_at(self, e_m: float, n_m: float) -> tuple[Hypothesis, float]:
         """Hypothesis with the highest standardised correlation within two cells of a camera position, and that
