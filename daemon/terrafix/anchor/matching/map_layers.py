@@ -107,6 +107,8 @@ class MapLayers:
     ) -> tuple[MapLayer, CorrelationResult]:
         """The layer to use for this frame, with its result. ``belief``: before the correlation, so that no layer is
         scored at its own maximum; ``weight``: share of new ground."""
+        if len(self._all) == 1:
+            return self.best, results[self._selector.best]
         mode = belief.mode()
         scores = {
             table: result.best_at(mode.e_m, mode.n_m)[1] if result.verdict is Verdict.ACCEPTED else None
