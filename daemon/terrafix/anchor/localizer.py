@@ -45,7 +45,7 @@ from terrafix.anchor.relocalization.relocalizer import (
     unknown_sigma_m,
 )
 from terrafix.anchor.verification.converged_place import PlaceTest
-from terrafix.anchor.verification.image_shape import STRETCHES, ImageShape
+from terrafix.anchor.verification.image_shape import AS_DESCRIBED, STRETCHES, ImageShape
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
 from terrafix.anchor.verification.single_frame import LIKELIHOOD_RATIO, MAX_MODES, localize_single_frame
 from terrafix.core.camera import CameraCalibration, Readout
@@ -334,7 +334,8 @@ class Localizer:
         """Updates the posterior of another shape of the images. ``hypothesis``, ``score``: of the best mode."""
         if seen.layer.drawn or not self._shape.is_in_doubt(score):
             return
-        scores = seen.layer.matcher.stretched_scores(seen.image, seen.view, belief, hypothesis, STRETCHES)
+        scores = seen.layer.matcher.stretched_scores(seen.image, seen.view, belief, hypothesis, STRETCHES[1:])
+        scores[AS_DESCRIBED] = seen.correlation.scores[seen.correlation.hypotheses.index(hypothesis)]
         if len(scores) == len(STRETCHES):
             self._shape.add(scores, seen.weight)
 

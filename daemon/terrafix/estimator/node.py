@@ -275,9 +275,7 @@ class EstimatorNode(NodeBase):
             self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
         fix = UserFixMeasurement(np.array(axes.to_local(hint.lat_deg, hint.lon_deg)), hint.sigma_m)
         fusion = apply_user_fix(estimator.state, hint.frame_id, fix)
-        fragment = estimator.state.fragment_of(hint.frame_id)
-        for verdict in (fusion, *self._rebuild_verdicts(estimator)):
-            yield verdict_of(hint.t_ns, hint.frame_id, verdict, fragment)
+        yield from self._verdicts(estimator, hint, fusion)
         if fusion.verdict is Verdict.ACCEPTED and estimator.last is not None:
             self._relocated = True
             yield self._estimate(estimator, estimator.last, self._claim(estimator.last), hint.t_ns)
@@ -331,9 +329,7 @@ class EstimatorNode(NodeBase):
         self._relocated = False
         result = estimator.feed_frame(frame)
         self._tracked = result.verdict is Verdict.ACCEPTED
-        verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
-        fragment = estimator.state.fragment_of(odometry.frame_id)
-        yield from (verdict_of(odometry.t_ns, odometry.frame_id, verdict, fragment) for verdict in verdicts)
+        yield from self._verdicts(estimator, odometry, *result.verdicts)
         no_new_view = odometry.verdict in NO_NEW_VIEW or result.verdict is Verdict.STALLED
         no_new_view = no_new_view or estimator.state.orientation.refuses  # the anchor would search for it elsewhere
         if not no_new_view and not self._awaits_telemetry(odometry.t_ns, frame.attitude, estimator):
@@ -446,11 +442,15 @@ class EstimatorNode(NodeBase):
         self._predicted_m2 = tangent_to_world(last.cov, last.pose.rotation().matrix())[:2, :2]
         return True
 
-    def _rebuild_verdicts(self, estimator: Estimator) -> list[FusionVerdict]:
-        """The graph was rebuilt from its last good estimate since the call before."""
+    def _verdicts(
+        self, estimator: Estimator, of: Odometry | PositionHint | Relocalization | MapMatch, *verdicts: FusionVerdict
+    ) -> list[Message]:
+        """``verdicts``, and one more where the graph was rebuilt from its last good estimate since the call before."""
         before, self._rebuilds = self._rebuilds, estimator.graph.rebuilds
-        rebuilt = estimator.graph.rebuilds > before
-        return [FusionVerdict("reset", Verdict.ACCEPTED, None, ResetReason.INDETERMINATE.value)] if rebuilt else []
+        if estimator.graph.rebuilds > before:
+            verdicts += (FusionVerdict("reset", Verdict.ACCEPTED, None, ResetReason.INDETERMINATE.value),)
+        fragment = estimator.state.fragment_of(of.frame_id)
+        return [verdict_of(of.t_ns, of.frame_id, verdict, fragment) for verdict in verdicts]
 
     def _awaits_telemetry(self, t_ns: int, attitude: Attitude, estimator: Estimator) -> bool:
         """Whether a frame at ``t_ns`` comes so early that heading and height may yet be reported: the anchor would
@@ -503,9 +503,7 @@ class EstimatorNode(NodeBase):
             self._note_predicted_frame(estimator)  # before it moves: the anchor's belief has to move as far
         result = estimator.feed_relocalization(seen if self._shutter is None else self._shutter.relocalized(seen))
         fusion = result.fusion
-        fragment = estimator.state.fragment_of(seen.frame_id)
-        for verdict in (fusion, *self._rebuild_verdicts(estimator)):
-            yield verdict_of(seen.t_ns, seen.frame_id, verdict, fragment)
+        yield from self._verdicts(estimator, seen, fusion)
         if fusion.verdict is not Verdict.ACCEPTED or estimator.last is None:
             return
         self._relocated = True
@@ -526,9 +524,8 @@ class EstimatorNode(NodeBase):
         was_multimodal = estimator.hypotheses.is_multimodal
         outcome = flight.fuse(match, self.mode)
         result = outcome.result
-        verdicts = (*result.verdicts, *self._rebuild_verdicts(estimator))
+        yield from self._verdicts(estimator, match, *result.verdicts)
         fragment = estimator.state.fragment_of(match.frame_id)
-        yield from (verdict_of(match.t_ns, match.frame_id, verdict, fragment) for verdict in verdicts)
         yield outcome.solution
         accepted = result.verdict is Verdict.ACCEPTED
         if (accepted or result.verdict in NOTHING_FOUND) and fragment is not None and estimator.last is not None:

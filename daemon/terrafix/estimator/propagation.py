@@ -223,7 +223,7 @@ class Propagation:
 
     def _reset_velocity(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
         """A new graph where odometry has been to one side of the prediction for frames. Either of the two is wrong. The
-        velocity before these frames, and inertial readings since, are believed, as far as the images may be right,
+        velocity before these frames, and inertial readings since, are the prior, as wide as the images may be right,
         until places confirm these; without such readings velocity is unknown."""
         innovation, (off_m, before) = predicted.odometry.motion_innovation, self._doubt.take_run()
         assert innovation is not None
@@ -241,7 +241,7 @@ class Propagation:
 
     def _reset_standstill(self, predicted: PredictedFrame, verdicts: list[FusionVerdict]) -> PropagationResult:
         """A new graph where images that are now known to be repeated have shown a standstill. The velocity before them
-        is believed, as far as the vehicle may have stopped; its way since then is not known."""
+        is the prior, as wide as the vehicle may have stopped; its way since then is not known."""
         before = self._doubt.before_static
         assert before is not None
         self._doubt.before_static = None

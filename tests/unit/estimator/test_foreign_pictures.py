@@ -218,7 +218,7 @@ def test_no_prediction_is_published_for_a_frozen_picture(frozen_run: tuple[Fligh
     assert predicted >= {FIRST - 1, *range(END, FRAMES)}
 
 
-def test_the_standstill_that_the_first_repeated_pictures_have_shown_is_not_believed() -> None:
+def test_the_standstill_that_the_first_repeated_pictures_have_shown_is_discarded() -> None:
     """A slow vehicle without inertial readings could have stopped: the first of them is fused."""
     flight = Flight(FRAMES, seed=8, speed_mps=8.0)
     listener = flown({i: frozen(flight, i) for i in range(FIRST, END)}, flight)
@@ -320,7 +320,7 @@ def test_contradicted_velocity_is_reset_once_after_the_timeout(speed_mps: float,
 
 
 def test_a_velocity_that_one_motion_has_shown_is_reset_as_soon_as_as_many_contradict_it() -> None:
-    """The first motion of a flight is believed: nothing predicts it."""
+    """The first motion of a flight is fused: nothing predicts it."""
     flight, fast = Flight(FRAMES, seed=8), Flight(FRAMES, seed=8, speed_mps=55.0)
     listener = EstimatorRun().fly(flight, 0, 1)
     for i in range(1, 6):

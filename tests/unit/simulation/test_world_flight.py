@@ -26,10 +26,11 @@ from terrafix_lab.sim.flights.folder import (
     plan_flight,
     write_flight,
 )
-from terrafix_lab.sim.flights.make import FlightOptions, make
+from terrafix_lab.sim.flights.make import FlightOptions, make, write_map
 from terrafix_lab.sim.flights.scene import Scene, scene_of_image, scene_of_place, scene_of_world
 from terrafix_lab.sim.world import place as world
 from terrafix_tools.cli import app
+from terrafix_tools.mapping.build import build_package, layer_of
 from terrafix_tools.mission.items import Box
 
 DURATION_S = 90.0
@@ -211,6 +212,12 @@ def test_invalid_options_are_rejected_before_anything_is_written(
     with pytest.raises(kind, match=reason):
         make(tmp_path / "out", FlightOptions(**changes))  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_map_package_of_two_layers_is_taken_as_it_is(image: Path, tmp_path: Path) -> None:
+    package = build_package([layer_of(image), layer_of(image, date="2020-05-01")], tmp_path / "two.gpkg")
+    write_map(tmp_path / "map.gpkg", FlightOptions(image=image, map_path=package), None)
+    assert (tmp_path / "map.gpkg").read_bytes() == package.read_bytes()
 
 
 def test_a_mission_outside_the_image_or_without_room_is_an_error(image: Path, tmp_path: Path) -> None:

@@ -117,11 +117,14 @@ AS_PREDICTED = Hypothesis(0.0, 1.0)  # the zero hypothesis [spec: identity]
 
 @dataclass(frozen=True)
 class CorrelationResult:
+    """``evidence_nats``: that ``Belief.update`` returns for a full observation, where layers are compared by it."""
+
     verdict: Verdict
     surfaces: tuple[Surface, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
     footprint_m: float = 1.0
     cell_m: float = 1.0
+    evidence_nats: float = -math.inf
 
     def best_at(self, e_m: float, n_m: float) -> tuple[Hypothesis, float]:
         """Hypothesis with the highest standardised correlation within two cells of a camera position, and that
@@ -316,12 +319,13 @@ class FrameMatcher:
         describer = features.describer
         cell = gsd * describer.stride
         cells = gsd, describer.stride
-        (first,) = self.rectify_all(image, view, (AS_PREDICTED,), *cells)
+        wanted = tuple(dict.fromkeys((AS_PREDICTED, *hypotheses)))
+        frames = dict(zip(wanted, self.rectify_all(image, view, wanted, *cells), strict=True))
+        first = frames[AS_PREDICTED]
         if first is None or min(first.mask.shape) < describer.stride * MIN_SIDE_CELLS / 2:
             return CorrelationResult(Verdict.TOO_LOW)
         footprint_m = float(np.sqrt(first.mask.sum())) * gsd
-        frames = [first] if hypotheses == (AS_PREDICTED,) else self.rectify_all(image, view, hypotheses, *cells)
-        usable = [(h, f) for h, f in zip(hypotheses, frames, strict=True) if f is not None]
+        usable = [(h, f) for h in hypotheses if (f := frames[h]) is not None]
         extents = [self._extent(f) for _, f in usable]
         e_min = belief.centre[0] - belief.half_m + min(r[0] for r in extents)
         n_max = belief.centre[1] + belief.half_m + max(r[1] for r in extents)

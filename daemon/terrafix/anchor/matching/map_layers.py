@@ -1,7 +1,6 @@
 """The layers of a map: one bound map and one matcher per date, and the selection of the layer in use."""
 
 import copy
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -91,19 +90,25 @@ class MapLayers:
     def correlate(self, image: Image, view: View, belief: Belief) -> dict[str, CorrelationResult]:
         """Correlation with the layer in use, first, and from time to time with a second one. With the drawn layer where
         the first one is evidence against the belief."""
-        results = {
-            table: self._all[table].matcher.correlate(image, view, belief)
-            for table in self._selector.layers_to_correlate()
-        }
-        if self._drawn and _evidence(results[self._selector.best], belief) < 0.0:
-            results[self._drawn] = self._all[self._drawn].matcher.correlate(image, view, belief)
+        tables = self._selector.layers_to_correlate()
+        results = {table: self._correlate(table, image, view, belief) for table in tables}
+        if self._drawn and results[self._selector.best].evidence_nats < 0.0:
+            results[self._drawn] = self._correlate(self._drawn, image, view, belief)
         return results
+
+    def _correlate(self, table: str, image: Image, view: View, belief: Belief) -> CorrelationResult:
+        result = self._all[table].matcher.correlate(image, view, belief)
+        if not self._drawn or result.verdict is not Verdict.ACCEPTED:
+            return result
+        return replace(result, evidence_nats=copy.copy(belief).update(result.surfaces, 1.0))
 
     def select(
         self, results: dict[str, CorrelationResult], belief: Belief, weight: float
     ) -> tuple[MapLayer, CorrelationResult]:
         """The layer to use for this frame, with its result. ``belief``: before the correlation, so that no layer is
         scored at its own maximum; ``weight``: share of new ground."""
+        if len(self._all) == 1:
+            return self.best, results[self._selector.best]
         mode = belief.mode()
         scores = {
             table: result.best_at(mode.e_m, mode.n_m)[1] if result.verdict is Verdict.ACCEPTED else None
@@ -111,14 +116,9 @@ class MapLayers:
             if table != self._drawn
         }
         used = self._selector.update(scores, weight) or next(iter(results))
-        if self._drawn in results and _evidence(results[self._drawn], belief) > _evidence(results[used], belief):
+        if self._drawn in results and results[self._drawn].evidence_nats > results[used].evidence_nats:
             used = self._drawn
         return self._all[used], results[used]
-
-
-def _evidence(result: CorrelationResult, belief: Belief) -> float:
-    """[nats] That ``Belief.update`` would return for a full observation; minus infinity without a correlation."""
-    return copy.copy(belief).update(result.surfaces, 1.0) if result.verdict is Verdict.ACCEPTED else -math.inf
 
 
 def _file_identity(package: MapPackage) -> str:

@@ -81,8 +81,8 @@ def rectify(
         source = blurred[shrink]
     if camera.distortion or camera.radial_k1 or camera.readout is not None or relief is not None:
         px = _lens_map(camera, r_w_c, ground, (height, width), relief)
-        flat = cv2.remap(source, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
-        mask = (px >= 0).all(-1) & (px[..., 0] <= camera.width - 1) & (px[..., 1] <= camera.height - 1)
+        flat, (x, y) = cv2.remap(source, px, None, cv2.INTER_LINEAR), np.moveaxis(px, -1, 0)
+        mask = (x >= 0) & (y >= 0) & (x <= camera.width - 1) & (y <= camera.height - 1)
     else:
         matrix = camera.matrix() @ (r_w_c.T @ ground)
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

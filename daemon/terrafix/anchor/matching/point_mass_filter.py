@@ -162,14 +162,18 @@ class Belief:
         return modes
 
     def _mode_at(self, r: int, c: int, gathered: np.ndarray) -> Mode:
-        radius = MODE_RADIUS_CELLS
-        rows, columns = np.ogrid[: len(self._mass), : len(self._mass)]
-        distance2 = (rows - r) ** 2 + (columns - c) ** 2
-        near = np.where(distance2 <= radius**2, self._mass, 0.0)
+        reach = 2 * MODE_RADIUS_CELLS
+        top, left = max(r - reach, 0), max(c - reach, 0)
+        window = slice(top, r + reach + 1), slice(left, c + reach + 1)
+        rows, columns = (np.arange(side) for side in self._mass[window].shape)
+        distance2 = (rows[:, None] + top - r) ** 2 + (columns + left - c) ** 2
+        near = np.where(distance2 <= MODE_RADIUS_CELLS**2, self._mass[window], 0.0)
         mass = float(near.sum())
-        e_m = self._e0 + float((near.sum(0) * np.arange(len(self._mass))).sum()) / mass * self.cell_m
-        n_m = self._n0 - float((near.sum(1) * np.arange(len(self._mass))).sum()) / mass * self.cell_m
-        second_mass = float(np.where(distance2 > (2 * radius) ** 2, gathered, 0.0).max())
+        e_m = self._e0 + (left + float(near.sum(0) @ columns) / mass) * self.cell_m
+        n_m = self._n0 - (top + float(near.sum(1) @ rows) / mass) * self.cell_m
+        others = gathered.copy()
+        others[window][distance2 <= reach**2] = 0.0
+        second_mass = float(others.max())
         var = float((near * distance2).sum()) / mass / 2 * self.cell_m**2
         return Mode(e_m, n_m, min(mass, 1.0), second_mass, var)
 

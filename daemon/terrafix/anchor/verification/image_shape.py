@@ -15,8 +15,9 @@ from terrafix.core.agreement import STATED, Agreement, Cause, Range
 # Scale of a stretched axis. [spec: 4:3, 3:2 and 16:9 differ by 1.19 and 1.33; a correlation tolerates a tenth]
 STRETCH = 1.25
 Stretch = tuple[float, float]  # focal lengths in x and y over the described ones
+AS_DESCRIBED: Stretch = (1.0, 1.0)  # [spec: identity]
 # Height and focal length of a description may be wrong as well: both axes are. [spec: geometry]
-SAME_SHAPE: tuple[Stretch, ...] = ((1.0, 1.0), (STRETCH, STRETCH), (1.0 / STRETCH, 1.0 / STRETCH))
+SAME_SHAPE: tuple[Stretch, ...] = (AS_DESCRIBED, (STRETCH, STRETCH), (1.0 / STRETCH, 1.0 / STRETCH))
 # By the scale of the x axis over that of the y axis. [spec: geometry]
 OTHER_SHAPES: dict[float, tuple[Stretch, ...]] = {
     STRETCH: ((STRETCH, 1.0), (1.0, 1.0 / STRETCH)),

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 # A patch's correlation in standard deviations of its own surface: N(UNCHANGED_Z, UNCHANGED_SIGMA) where the ground is
 # the same, N(0, 1) elsewhere and where it has changed. UNCHANGED_SHARE: prior share of unchanged patches. [tuned]
@@ -126,11 +127,10 @@ def _grid_search(llr: np.ndarray, jacobian: np.ndarray, cell: float) -> np.ndarr
     shifts = [np.rint(jacobian @ motion / cell).astype(int) for motion in grid]
     pad = max(int(np.abs(shift).max()) for shift in shifts)
     padded = np.pad(near, ((0, 0), (pad, pad), (pad, pad)))  # zero evidence outside of the searched area
+    shifted = sliding_window_view(padded, (side, side), axis=(1, 2))
     best, best_motion = -np.inf, grid[0]
     for motion, shift in zip(grid, shifts, strict=True):
-        total = np.zeros((side, side), np.float32)
-        for surface, (east, north) in zip(padded, shift, strict=True):
-            total += surface[pad - north : pad - north + side, pad + east : pad + east + side]
+        total = shifted[np.arange(len(llr)), pad - shift[:, 1], pad + shift[:, 0]].sum(axis=0)
         prior = 0.5 * ((motion[2] / YAW_SIGMA_RAD) ** 2 + (motion[3] / PATCH_SCALE_SIGMA) ** 2)
         r, c = np.unravel_index(int(np.argmax(total)), total.shape)
         value = INDEPENDENT_PATCH_SHARE * float(total[r, c]) - prior
@@ -150,21 +150,24 @@ def _best_offsets(
     side = llr.shape[1]
     k = max(round(radius / cell), 1)
     reach2 = (max(radius / cell, 1.0) + 1.0) ** 2  # a cell beyond, where the weight is zero
-    rows, columns = side // 2 - expected[:, 1] / cell, side // 2 + expected[:, 0] / cell
+    row, column = side // 2 - expected[:, 1] / cell, side // 2 + expected[:, 0] / cell
+    r, c = np.rint(row).astype(int), np.rint(column).astype(int)
+    there = np.flatnonzero((r >= 0) & (r < side) & (c >= 0) & (c < side))
+    outside = ((0, 0), (k, k), (k, k))
+    near, near_llr = (
+        sliding_window_view(np.pad(x, outside, constant_values=-np.inf), (2 * k + 1, 2 * k + 1), axis=(1, 2))[
+            there, r[there], c[there]
+        ].reshape(len(there), -1)
+        for x in (z, llr)
+    )
     offsets, value = expected.copy(), np.zeros(len(llr))
-    for i, (surface, row, column) in enumerate(zip(z, rows.tolist(), columns.tolist(), strict=True)):
-        r, c = round(row), round(column)
-        if not (0 <= r < side and 0 <= c < side):
-            continue
-        top, left = max(r - k, 0), max(c - k, 0)
-        near = surface[top : r + k + 1, left : c + k + 1]
-        best = int(np.argmax(near))
-        value[i] = llr[i, top : r + k + 1, left : c + k + 1].ravel()[best]
-        dr = np.arange(top, top + near.shape[0]) - row
-        dc = np.arange(left, left + near.shape[1]) - column
-        weight = np.exp(PEAK_SHARPNESS * (near - near.ravel()[best]))
-        weight *= np.maximum(1.0 - (dr[:, None] ** 2 + dc**2) / reach2, 0.0)
-        total = float(weight.sum())
-        offsets[i, 0] += float(weight.sum(axis=0) @ dc) / total * cell
-        offsets[i, 1] -= float(weight.sum(axis=1) @ dr) / total * cell
+    best = np.arange(len(there)), near.argmax(axis=1)
+    value[there] = near_llr[best]
+    around = np.arange(-k, k + 1)
+    dr, dc = ((r - row)[there, None] + around, (c - column)[there, None] + around)
+    weight = np.exp(PEAK_SHARPNESS * (near - near[best][:, None])).reshape(-1, len(around), len(around))
+    weight = weight * np.maximum(1.0 - (dr[:, :, None] ** 2 + dc[:, None] ** 2) / reach2, 0.0)
+    total = weight.sum(axis=(1, 2))
+    offsets[there, 0] += (weight.sum(axis=1) * dc).sum(axis=1) / total * cell
+    offsets[there, 1] -= (weight.sum(axis=2) * dr).sum(axis=1) / total * cell
     return offsets, value

@@ -239,10 +239,10 @@ def fuse_odometry_increment(
     correction (8,) of V at the end."""
     d2 = float(innovation_m @ np.linalg.solve(predicted_cov[DELTA_P, DELTA_P] + odometry_cov, innovation_m))
     if d2 > GATE[3]:  # the model missed something: a gust, a manoeuvre, an image with a wrong time
-        wider = (d2 / GATE[3] - 1.0) * increment.cov
+        # Without inertial readings as wide as this innovation is the most likely one [spec: maximum likelihood of a
+        # variance, 3 dimensions].
+        wider = (d2 / (GATE[3] if increment.inertial else 3.0) - 1.0) * increment.cov
         if not increment.inertial:
-            # As wide as this innovation is the most likely one [spec: maximum likelihood of a variance, 3 dimensions].
-            wider = (d2 / 3.0 - 1.0) * increment.cov
             # An image of another time is no acceleration, which would change the velocity by twice the way over the
             # time. Inertial readings tell: innovations are tested as a run (integrity/signed_innovations.py).
             wider[DELTA_V, DELTA_V] += (2.0 / increment.phi_pv_s) ** 2 * float(innovation_m @ innovation_m) * np.eye(3)

@@ -163,7 +163,7 @@ class Monitors:
             nothing = False
         if found or nothing:
             self._registration.add_attempt(found=found)
-        if not pose or match.pose is None:
+        if not pose or match.pose is None or not match.inliers:  # a place without inliers has neither (decision 072)
             return
         reported = telemetry.at(match.t_ns)
         if reported.yaw_rad is not None:

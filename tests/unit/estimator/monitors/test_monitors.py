@@ -421,15 +421,17 @@ def test_correlations_with_a_drawn_map_do_not_count_against_registration() -> No
     assert _fly(partial(_unmatched, matcher=f"gradient{ON_DRAWN}"), fix_every=1)[1] == []
 
 
-def _heading_faults(frames: int, off_rad: Callable[[int], float]) -> list[CalibrationFault]:
-    """Changes of the faults in a flight whose reported heading is off by ``off_rad`` (frame), matched in each frame."""
+def _heading_faults(frames: int, off_rad: Callable[[int], float], inliers: int = 30) -> list[CalibrationFault]:
+    """Changes of the faults in a flight whose reported heading is off by ``off_rad`` (frame), matched in each frame by
+    ``inliers`` patches; 0: a place that the frame alone has selected, without a pose."""
     monitors, telemetry, flight = Monitors(ORIGIN), Telemetry(), Flight(frames, dem=True)
     faults = []
     for i in range(frames):
         state, _, *_ = flight.messages(i)
         assert isinstance(state, VehicleState) and state.yaw_rad is not None
         telemetry.add(msgspec.structs.replace(state, yaw_rad=state.yaw_rad + off_rad(i)))
-        monitors.on_map_match(flight.fix(i), telemetry, accepted=True)
+        match = msgspec.structs.replace(flight.fix(i), inliers=inliers)
+        monitors.on_map_match(match, telemetry, accepted=True)
         faults += monitors.take_changes(t_ns(i))
     return faults
 
@@ -438,6 +440,7 @@ def test_map_poses_identify_a_compass_error_of_90_degrees_once() -> None:
     (fault,) = _heading_faults(60, lambda _: math.pi / 2)
     assert (fault.quantity, fault.active) == ("heading", True)
     assert fault.factor == pytest.approx(90.0, abs=15.0)
+    assert _heading_faults(60, lambda _: math.pi / 2, inliers=0) == []
 
 
 def test_a_fault_is_reported_again_when_its_factor_changes() -> None:

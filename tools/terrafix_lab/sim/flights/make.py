@@ -1,6 +1,7 @@
 """`terrafix sim make`: a flight folder over generated or real ground, with its map."""
 
 import math
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
 from terrafix.core.errors import OutputError, UsageError
+from terrafix.map.package import MapPackage
 from terrafix.messages import Camera
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights.folder import (
@@ -107,11 +109,18 @@ def scene_of(wanted: FlightOptions) -> tuple[Scene, world.World | None]:
 
 
 def write_map(package: Path, wanted: FlightOptions, place: world.World | None) -> None:
-    """Writes the map package of another date or season. Raises MapError, OutputError."""
+    """Writes the map package of another date or season; a given package as it is. Raises MapError, OutputError."""
     if place is None:
         source = wanted.map_path or wanted.image
         assert source is not None  # without a place there is an image
-        build(source, package, dem=wanted.dem)
+        if source.suffix.lower() != ".gpkg":
+            build(source, package, dem=wanted.dem)
+            return
+        MapPackage.open(source).close()
+        try:
+            shutil.copyfile(source, package)
+        except OSError as error:
+            raise OutputError(f"{package}: cannot be written ({error.strerror}); choose another --out") from None
         return
     mapped.write_map(place, package, content=wanted.map_content)
 
