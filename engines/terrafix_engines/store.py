@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from terrafix_engines.manifest import Manifest, ManifestError, find_manifest
+from terrafix_engines.manifest import SHIPPED, Manifest, ManifestError, find_manifest
 from terrafix_engines.providers import PREFERENCE
 from terrafix_engines.runtime import Model, ModelFileError
 
@@ -80,7 +80,9 @@ class StoredModel:
 
 
 def stored_model(manifest: Manifest, folder: Path) -> StoredModel:
-    return StoredModel(manifest, folder / manifest.file, folder / ENGINES)
+    """The weights that the program brings lie beside their manifest, others in ``folder``."""
+    shipped = SHIPPED / manifest.file
+    return StoredModel(manifest, shipped if shipped.is_file() else folder / manifest.file, folder / ENGINES)
 
 
 def resolve_model(text: str, slot: str, folder: Path) -> StoredModel | Path:

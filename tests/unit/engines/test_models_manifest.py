@@ -1,5 +1,6 @@
 """Manifests: the shipped ones are valid, and errors in a user's own are reported in one line."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,10 @@ from terrafix_engines.manifest import ManifestError, Preset
 from terrafix_engines.providers import CPU, CUDA, TENSORRT, provider_chain, tensorrt_options
 from terrafix_engines.runtime import ModelFileError
 from terrafix_engines.store import State, StoredModel, models_folder, resolve_model, stored_model
+from terrafix_lab.train.ground import read_list
+from terrafix_tools.models.matching import read_sets
+
+OWN_WEIGHTS = "terrafix-1"
 
 HEAD = f'file = "tiny.onnx"\nsha256 = "{"0" * 64}"\nsize_bytes = 7\n'
 WHOLE = HEAD + tiny_onnx.XFEAT_LIKE
@@ -21,10 +26,25 @@ def written(folder: Path, text: str, name: str = "tiny.toml") -> Path:
     return path
 
 
+def test_the_shipped_weights_are_those_of_their_manifest_and_none_of_their_images_judges_them(tmp_path: Path) -> None:
+    """Each input with its licence and sha256."""
+    found = stored_model(manifest.find_manifest(OWN_WEIGHTS, tmp_path), tmp_path)
+    assert found.state() is State.READY and found.path.parent == manifest.SHIPPED
+    assert found.path.stat().st_size <= 2_000_000
+    text = (manifest.SHIPPED / f"{OWN_WEIGHTS}.toml").read_text(encoding="utf-8")
+    inputs = re.findall(r"(?m)^# (?:trained on|held out): (\S+), sha256 [0-9a-f]{64}, \S.*$", text)
+    lists = Path(__file__).parents[3] / "config/training"
+    places = read_list(lists / "places.toml")
+    assert inputs == [name for place in places for name in place.pictures or [place.name]]
+    assert set(inputs).isdisjoint(path for one in read_sets(lists / "judges.toml") for path in (one.camera, one.map))
+
+
 def test_the_shipped_manifests_have_a_source_and_a_licence() -> None:
     shipped = [manifest.read(path) for path in manifest.SHIPPED.glob("*.toml")]
-    assert {m.name for m in shipped} == {"xfeat", "lighterglue-l3"}
+    assert {m.name for m in shipped} == {"xfeat", "lighterglue-l3", OWN_WEIGHTS}
     for m in shipped:
+        if m.name == OWN_WEIGHTS:
+            continue
         assert m.source.startswith("https://") and m.licence == "Apache-2.0" and m.credit
         assert m.source.endswith(m.file)
 
@@ -109,7 +129,9 @@ def test_a_configured_model_is_resolved_as_name_or_path(tmp_path: Path) -> None:
     assert resolve_model("own.onnx", "xfeat", tmp_path) == Path("own.onnx")
     found = resolve_model("tiny", "xfeat", tmp_path)
     assert isinstance(found, StoredModel) and found.path == tmp_path / "tiny.onnx" and found.state() is State.READY
-    with pytest.raises(ModelFileError, match="no model is called 'superglue'; known: lighterglue-l3, xfeat, tiny"):
+    with pytest.raises(
+        ModelFileError, match="no model is called 'superglue'; known: lighterglue-l3, terrafix-1, xfeat, tiny"
+    ):
         resolve_model("superglue", "xfeat", tmp_path)
     with pytest.raises(
         ModelFileError, match="'lighterglue-l3' cannot be used as xfeat: its role is matcher, not dense"

@@ -106,8 +106,13 @@ class Training:
     def _held_out_nats(self) -> float:
         self.network.eval()
         rng, batch = np.random.default_rng(EVALUATION_SEED), self.recipe.batch
+        g = torch.Generator(self.device).manual_seed(EVALUATION_SEED)
+        # With other weather, as in training: without it the loss is near zero before the weights are good, and the best
+        # of them is one of chance. [measured: docs/decisions/074-weights-that-ship.md]
         batches = [
-            self._criterion(self.network, sample_views(self._held_out, batch, rng, EVALUATION_RANGES))[0]
+            self._criterion(
+                self.network, augment_views(sample_views(self._held_out, batch, rng, EVALUATION_RANGES), g)
+            )[0]
             for _ in range(max(EVALUATION_VIEWS // batch, 1))
         ]
         self.network.train()

@@ -32,15 +32,12 @@ def select_models(names: list[str], folder: str) -> list[StoredModel]:
 
 
 def fetched_models(names: list[str], folder: str) -> list[StoredModel]:
-    """Returns the models with these names, or all whose file exists. Raises ModelError when there is none."""
+    """Returns the models with these names, or all whose file exists. Raises ModelError."""
     models = select_models(names, folder)
     if names:
         return models
     with as_model_errors():
-        existing = [model for model in models if model.exists()]
-    if not existing:
-        raise ModelError(f"{models_folder(folder)}: no model is there yet; terrafix models fetch NAME")
-    return existing
+        return [model for model in models if model.exists()]
 
 
 def state_of(model: StoredModel) -> State:

@@ -21,11 +21,9 @@ from rich.table import Table
 
 from terrafix.anchor.matching.descriptor_cache import Describer
 from terrafix.anchor.matching.frame_matcher import (
-    FIX_GSD_PER_AGL,
     CorrelationResult,
     FrameMatcher,
     View,
-    bounded_cells,
     hypotheses_of,
 )
 from terrafix.anchor.matching.point_mass_filter import MAX_HALF_CELLS, Belief, Mode, belief_cell_m
@@ -91,7 +89,7 @@ class Ground:
 class Look:
     """``right``: the heaviest mode is; ``placed``: whether the chosen one is, None: none was chosen; ``lead_nats``: log
     ratio of the masses of the two heaviest modes; ``margin_sd``: standardised correlation at the right place less that
-    of the best wrong one, NaN with several kinds of surfaces."""
+    of the best wrong one."""
 
     right: bool
     placed: bool | None
@@ -194,24 +192,28 @@ def _flight(folder: Path, every: int, places: int) -> Ground:
 def _methods_on(
     ground: Ground, describers: dict[str, Describer], prior_m: float, *, yaw_known: bool
 ) -> Iterator[dict[str, Any]]:
-    """A row of the table for each describer, and for each model together with the gradients."""
+    """A row of the table for each describer, and for each model as a second channel of the gradients."""
     matchers = {name: FrameMatcher(ground.camera, ground.source, one) for name, one in describers.items()}
-    names = [(name,) for name in matchers] + [(GRADIENTS, name) for name in matchers if name != GRADIENTS]
-    looks: dict[tuple[str, ...], list[Look]] = {name: [] for name in names}
-    nulls: dict[tuple[str, ...], list[Look]] = {name: [] for name in names}
+    learned = [name for name in matchers if name != GRADIENTS]
+    names = [*matchers, *(f"{GRADIENTS}+{name}" for name in learned)]
+    looks: dict[str, list[Look]] = {name: [] for name in names}
+    nulls: dict[str, list[Look]] = {name: [] for name in names}
     rng = np.random.default_rng(SEED)
     for frame in ground.frames:
         view = frame.predicted if yaw_known else replace(frame.predicted, yaw_sigma_rad=math.pi)
         belief_at = _prior(view, prior_m, ground.source, rng, matchers[GRADIENTS])
         for mirrored in (False, True):
             image = np.ascontiguousarray(frame.image[:, ::-1]) if mirrored else frame.image
-            seen = {n: _correlated(n, one, matchers[n], image, view, belief_at()) for n, one in describers.items()}
+            seen = {name: _correlated(name, one, image, view, belief_at()) for name, one in matchers.items()}
+            found, cpu_ms = seen[GRADIENTS]
+            for name in learned:
+                second, more_ms = seen[name]
+                seen[f"{GRADIENTS}+{name}"] = found.with_second(second), cpu_ms + more_ms
             for name in names:
-                chosen = [seen[one] for one in name]
-                place = functools.partial(_place, image, view, chosen[-1][0], matchers[GRADIENTS])
-                (nulls if mirrored else looks)[name].append(_look(chosen, frame, belief_at(), place))
+                place = functools.partial(_place, image, view, seen[name][0], matchers[GRADIENTS])
+                (nulls if mirrored else looks)[name].append(_look(*seen[name], frame, belief_at(), place))
     for name in names:
-        yield _summary("+".join(name), looks[name], nulls[name])
+        yield _summary(name, looks[name], nulls[name])
 
 
 def _place(
@@ -244,41 +246,40 @@ def _prior(
 
 
 def _correlated(
-    method: str, describer: Describer, matcher: FrameMatcher, image: Image, view: View, belief: Belief
+    method: str, matcher: FrameMatcher, image: Image, view: View, belief: Belief
 ) -> tuple[CorrelationResult, float]:
     """With its processor time, ms; the map's descriptors are there already, as for all frames but a flight's first."""
     began_s = time.process_time()
     if method == GRADIENTS:
         found = matcher.correlate(image, view, belief)
     else:
-        gsd_m = matcher.cell_m(view.agl_m, FIX_GSD_PER_AGL[describer.name])
-        gsd_m, pool = bounded_cells(gsd_m, describer.stride, belief)
-        found = matcher.correlate_on(image, view, belief, hypotheses_of(view), gsd_m, pool, describer)
+        found = matcher.correlate_learned(image, view, belief, hypotheses_of(view))
     return found, (time.process_time() - began_s) * 1e3
 
 
 def _look(
-    seen: list[tuple[CorrelationResult, float]],
+    found: CorrelationResult,
+    cpu_ms: float,
     frame: Frame,
     belief: Belief,
     place: Callable[[list[Mode]], np.ndarray | None],
 ) -> Look:
-    """The belief after all of ``seen``, which are of the same frame, and the place that ``place`` chooses."""
-    used = [found for found, _ in seen if found.verdict is Verdict.ACCEPTED]
-    for found in used:
+    """The belief after ``found``, and the place that ``place`` chooses."""
+    is_used = found.verdict is Verdict.ACCEPTED
+    if is_used:
         belief.update(found.surfaces, 1.0)
     modes = belief.modes(MAX_MODES)
 
     def is_right(e_m: float, n_m: float) -> bool:
         return math.hypot(e_m - frame.predicted.e_m, n_m - frame.predicted.n_m) <= frame.near_m
 
-    chosen = place(modes) if used else None
+    chosen = place(modes) if is_used else None
     return Look(
         right=is_right(modes[0].e_m, modes[0].n_m),
         placed=None if chosen is None else is_right(float(chosen[0]), float(chosen[1])),
         lead_nats=math.log(modes[0].mass / max(modes[0].second_mass, 1e-12)),
-        margin_sd=_margin_sd(seen[0][0], frame) if len(seen) == 1 else math.nan,
-        cpu_ms=sum(cpu_ms for _, cpu_ms in seen),
+        margin_sd=_margin_sd(found, frame),
+        cpu_ms=cpu_ms,
     )
 
 
@@ -321,7 +322,7 @@ def _show(rows: list[dict[str, Any]]) -> None:
         table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
     for row in rows:
         placed, right = (f"{100 * row[key]:.0f} %" for key in ("placed", "right"))
-        sd = "-" if math.isnan(row["margin_sd"]) else f"{row['margin_sd']:.1f} sd"
+        sd = f"{row['margin_sd']:.1f} sd"
         counts = (f"{row[key]}" for key in ("wrong", "mirrored"))
         lead, cpu = f"{row['lead_nats']:.1f} nats", f"{row['cpu_ms']:.0f} ms"
         table.add_row(row["method"], placed, *counts, right, lead, sd, cpu)

@@ -38,8 +38,9 @@ from terrafix_engines.retrieval.pooled import PooledDescriber
 # Ground sampling distance of the correlation as a share of the height: coarse enough for speed and for tolerance to
 # small changes, fine enough for houses and kerbs. [tuned]
 CORRELATION_GSD_PER_AGL = 1 / 100
+OWN = "own"  # name of the describer with weights of docs/training.md
 # ground sampling distance of the patches as a share of the height [tuned]
-FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330, "own": 1 / 170}
+FIX_GSD_PER_AGL = {"gradient": 1 / 200, "xfeat": 1 / 330, OWN: 1 / 170}
 GSD_STEPS_PER_OCTAVE = 2  # Scales are rounded to this grid, so that the map's descriptors can be cached [tuned]
 # Side of a correlation window; a wider one is correlated on coarser cells, which bounds the cost of a look with a wide
 # belief. [measured: docs/decisions/047-cells-of-a-look.md]
@@ -153,6 +154,15 @@ class CorrelationResult:
         """The highest standardised correlation of each hypothesis."""
         return [float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in self.surfaces]
 
+    def with_second(self, other: "CorrelationResult") -> "CorrelationResult":
+        """Each surface, standardised anew after that of the same hypothesis in ``other`` was added; NaN where either is
+        unknown. This result alone if ``other`` lacks a hypothesis."""
+        others = dict(zip(other.hypotheses, other.surfaces, strict=True))
+        if not others.keys() >= set(self.hypotheses):
+            return self
+        both = zip(self.surfaces, self.hypotheses, strict=True)
+        return replace(self, surfaces=tuple(_sum(surface, others[hypothesis]) for surface, hypothesis in both))
+
     def scale_at(self, e_m: float, n_m: float) -> tuple[float, float] | None:
         """Scale of the height measured at a camera position, as (mean, variance), from the likelihoods of the scales
         that were correlated. None: the scales do not discriminate, or the best one is at the end of the grid, so that
@@ -213,8 +223,8 @@ class FrameMatcher:
         self._features = MapFeatures(source, describer, cache_bytes, store=store)
         self._by_pool: dict[tuple[str, int], MapFeatures] = {}
         self._cache_bytes, self._store = cache_bytes, store
-        # Correlation is always on gradients: on learned descriptors it finds no more frames at twice the processor
-        # time of a flight and more (docs/models.md). The model describes patches where those of gradients give no pose.
+        # Correlation is on gradients, and where the position is not known on weights of one's own as well. The model
+        # describes patches where those of gradients give no pose.
         self.gradients = describer if describer.stride == 1 else GradientDescriber()
         self.gradient_features = (
             self._features if describer.stride == 1 else MapFeatures(source, self.gradients, cache_bytes, store=store)
@@ -290,17 +300,29 @@ class FrameMatcher:
         Verdict TOO_LOW: the frame covers too few cells or sees no ground; OUTSIDE_MAP: no map data in the window.
         """
         hypotheses = self._next_subset(hypotheses_of(view))
-        image = without_colour(image, self.gradients)
+        grey = without_colour(image, self.gradients)
         gsd, pool = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
         # Of a drawn map, which says little, every hypothesis counts: the belief itself searches it. Its lines are as
         # clear on larger pixels.
         if self._drawn:
-            return self.correlate_on(image, view, belief, hypotheses, gsd * pool)
+            return self.correlate_on(grey, view, belief, hypotheses, gsd * pool)
         if len(hypotheses) > MAX_FINE_HYPOTHESES:
-            coarse = self.correlate_on(image, view, belief, hypotheses, gsd, 2 * pool)
+            coarse = self.correlate_on(grey, view, belief, hypotheses, gsd, 2 * pool)
             if coarse.verdict is Verdict.ACCEPTED:
                 hypotheses = coarse.best_hypotheses(MAX_FINE_HYPOTHESES)
-        return self.correlate_on(image, view, belief, hypotheses, gsd, pool)
+        found = self.correlate_on(grey, view, belief, hypotheses, gsd, pool)
+        # [measured: docs/decisions/074-weights-that-ship.md]
+        if self._describer.name != OWN or view.sigma_m < RELIEF_SIGMA * view.agl_m:
+            return found
+        return found.with_second(self.correlate_learned(image, view, belief, found.hypotheses))
+
+    def correlate_learned(
+        self, image: Image, view: View, belief: SearchWindow, hypotheses: tuple[Hypothesis, ...]
+    ) -> CorrelationResult:
+        """``correlate`` with the descriptors of the model."""
+        gsd = self.cell_m(view.agl_m, FIX_GSD_PER_AGL[self._describer.name])
+        cells = bounded_cells(gsd, self._describer.stride, belief)
+        return self.correlate_on(image, view, belief, hypotheses, *cells, self._describer)
 
     def correlate_on(
         self,
@@ -334,7 +356,7 @@ class FrameMatcher:
         descriptors, valid, e_min, n_max = features.window(e_min, n_max, width, height, gsd)
         if not valid.any():
             return CorrelationResult(Verdict.OUTSIDE_MAP)
-        window = CorrelationWindow(descriptors, valid, self._drawn, self._correlator)
+        window = CorrelationWindow(descriptors, valid, self._drawn, self._correlator if learned is None else None)
         correlations = window.correlate_all([_describe(frame, describer) for _, frame in usable])
         surfaces = []
         for (_, frame), correlation in zip(usable, correlations, strict=True):
@@ -441,6 +463,16 @@ class FrameMatcher:
         """Extent of a rectified frame relative to the nadir, metres: e_min, n_max, e_max, n_min."""
         h, w = frame.mask.shape
         return (frame.e_min_m, frame.n_max_m, frame.e_min_m + w * frame.gsd_m, frame.n_max_m - h * frame.gsd_m)
+
+
+def _sum(first: Surface, second: Surface) -> Surface:
+    """On the cells of ``first``."""
+    height, width = first.z.shape
+    x = (first.e0_m - second.e0_m + np.arange(width) * first.cell_m) / second.cell_m
+    y = (second.n0_m - first.n0_m + np.arange(height) * first.cell_m) / second.cell_m
+    map_x, map_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+    there = cv2.remap(second.z, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
+    return replace(first, z=standardise(first.z + there))
 
 
 def bounded_cells(gsd: float, stride: int, belief: SearchWindow) -> tuple[float, int]:

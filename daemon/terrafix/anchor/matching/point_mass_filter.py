@@ -158,23 +158,31 @@ class Belief:
         for _ in range(count):
             r, c = (int(v) for v in np.unravel_index(int(np.argmax(remaining)), remaining.shape))
             modes.append(self._mode_at(r, c, gathered))
-            remaining[max(r - 2 * radius, 0) : r + 2 * radius + 1, max(c - 2 * radius, 0) : c + 2 * radius + 1] = 0.0
+            remaining[self._around(r, c)] = 0.0
         return modes
 
-    def _mode_at(self, r: int, c: int, gathered: np.ndarray) -> Mode:
+    def _around(self, r: int, c: int) -> tuple[slice, slice]:
+        """Rows and columns within two mode radii of a cell."""
         reach = 2 * MODE_RADIUS_CELLS
-        top, left = max(r - reach, 0), max(c - reach, 0)
-        window = slice(top, r + reach + 1), slice(left, c + reach + 1)
-        rows, columns = (np.arange(side) for side in self._mass[window].shape)
-        distance2 = (rows[:, None] + top - r) ** 2 + (columns + left - c) ** 2
-        near = np.where(distance2 <= MODE_RADIUS_CELLS**2, self._mass[window], 0.0)
+        return slice(max(r - reach, 0), r + reach + 1), slice(max(c - reach, 0), c + reach + 1)
+
+    def _mode_at(self, r: int, c: int, gathered: np.ndarray) -> Mode:
+        """``gathered``: mass within MODE_RADIUS_CELLS of each cell. Only cells around the mode are visited: passes over
+        a belief of a kilometre take longer than its correlation."""
+        around = self._around(r, c)
+        held = self._mass[around]
+        rows, columns = np.ogrid[: held.shape[0], : held.shape[1]]
+        rows, columns = rows + around[0].start, columns + around[1].start
+        distance2 = (rows - r) ** 2 + (columns - c) ** 2
+        near = np.where(distance2 <= MODE_RADIUS_CELLS**2, held, 0.0)
         mass = float(near.sum())
-        e_m = self._e0 + (left + float(near.sum(0) @ columns) / mass) * self.cell_m
-        n_m = self._n0 - (top + float(near.sum(1) @ rows) / mass) * self.cell_m
-        others = gathered.copy()
-        others[window][distance2 <= reach**2] = 0.0
-        second_mass = float(others.max())
+        e_m = self._e0 + float((near * columns).sum()) / mass * self.cell_m
+        n_m = self._n0 - float((near * rows).sum()) / mass * self.cell_m
         var = float((near * distance2).sum()) / mass / 2 * self.cell_m**2
+        of_mode = gathered[around].copy()
+        gathered[around][distance2 <= (2 * MODE_RADIUS_CELLS) ** 2] = 0.0
+        second_mass = float(gathered.max())
+        gathered[around] = of_mode
         return Mode(e_m, n_m, min(mass, 1.0), second_mass, var)
 
     def confirm(self, mode: Mode, likelihood_ratio: float) -> None:

@@ -22,6 +22,7 @@ from terrafix.anchor.matching.point_mass_filter import Belief, Surface
 from terrafix.core.geodesy import local_rotation_up
 from terrafix.core.pose import exp_so3, log_so3
 from terrafix.messages import MapMatch, MatchPlace, Verdict
+from terrafix_engines.features import open_describer
 from terrafix_engines.features.gradient import GradientDescriber
 from textured_ground import PINHOLE, FlatMap, SlopedMap, rotation, texture, view
 
@@ -133,6 +134,38 @@ def test_the_place_stands_out(matcher: FrameMatcher, frame: np.ndarray) -> None:
     belief.update(result.surfaces, 1.0)
     mode = belief.mode()
     assert (mode.e_m, mode.n_m) == pytest.approx(tuple(TRUE_M[:2]), abs=4.0)
+
+
+def test_shipped_weights_are_a_second_channel_where_the_position_is_not_known(
+    matcher: FrameMatcher, ground: np.ndarray, frame: np.ndarray
+) -> None:
+    learned = FrameMatcher(PINHOLE, FlatMap(ground), open_describer("terrafix-1"))  # type: ignore[arg-type]
+    belief = Belief(0.0, 0.0, 25.0, CELL_M)
+    (alone,) = matcher.correlate(frame, predicted_view(), belief).surfaces
+    both = learned.correlate(frame, predicted_view(), belief)
+    row, column = np.unravel_index(np.nanargmax(both.surfaces[0].z), alone.z.shape)
+    peak_m = alone.e0_m + column * alone.cell_m, alone.n0_m - row * alone.cell_m
+    assert peak_m == pytest.approx(tuple(TRUE_M[:2]), abs=4.0)
+    difference = np.nan_to_num(both.surfaces[0].z - alone.z)
+    assert 0.3 < difference.std() < 1.5
+    known = replace(predicted_view(), sigma_m=10.0)
+    np.testing.assert_array_equal(learned.correlate(frame, known, belief).surfaces[0].z, alone.z)
+
+
+def test_a_second_surface_is_added_place_by_place_whatever_its_cells() -> None:
+    """A peak of each at one place, and one of the second at another; unknown where the second one ends."""
+    noise = np.random.default_rng(3).normal(0.0, 1.0, (2, 200, 200)).astype(np.float32)
+    first, second = Surface(noise[0], -200.0, 200.0, 2.0), Surface(noise[1], -150.0, 240.0, 3.0)
+    first.z[100, 50] = 6.0  # east -100, north 0
+    second.z[79:82, 15:19] = 6.0  # the same
+    second.z[30:33, 60:63] = 6.0
+    found = CorrelationResult(Verdict.ACCEPTED, (first,), (Hypothesis(0.0, 1.0),))
+    added = found.with_second(replace(found, surfaces=(second,))).surfaces[0]
+    assert np.nanargmax(added.z) == np.ravel_multi_index((100, 50), added.z.shape)
+    assert added.z[100, 50] > 6.0
+    assert np.isnan(added.z[:, :24]).all() and np.isfinite(added.z[:, 26:]).all()  # the second begins at east -150
+    other = replace(found, surfaces=(second,), hypotheses=(Hypothesis(0.1, 1.0),))
+    assert found.with_second(other) is found
 
 
 @pytest.mark.slow

@@ -90,6 +90,24 @@ def test_two_similar_places_remain_two_modes() -> None:
     assert ee**0.5 > 25.0 > nn**0.5  # the covariance of the whole belief includes both modes
 
 
+def test_a_mode_has_the_mass_within_its_radius_and_the_next_one_is_beyond_two_of_them() -> None:
+    belief, rng = Belief(7.0, -3.0, 20.0, CELL_M), np.random.default_rng(4)
+    mass = rng.random(belief._mass.shape)
+    belief._mass, side = mass, len(mass)
+    rows, columns = np.indices((side, side), sparse=True)
+    for r, c in [(60, 50), (0, 0), (side - 1, 3), (40, side - 2)]:  # the border cuts the last three
+        off = np.hypot(rows - r, columns - c)
+        weights = mass / mass[off <= MODE_RADIUS_CELLS].sum() * (off <= MODE_RADIUS_CELLS)
+        gathered = mass + 2.0 * side - off  # the largest values are near the mode
+        before = gathered.copy()
+        mode = belief._mode_at(r, c, gathered)
+        assert mode.e_m == pytest.approx(belief._e0 + (weights * columns).sum() * CELL_M)
+        assert mode.n_m == pytest.approx(belief._n0 - (weights * rows).sum() * CELL_M)
+        assert mode.var_m2 == pytest.approx((weights * off**2).sum() / 2 * CELL_M**2)
+        assert mode.second_mass == gathered[off > 2 * MODE_RADIUS_CELLS].max()
+        assert (gathered == before).all()
+
+
 def test_the_next_frame_discriminates_between_two_modes() -> None:
     belief = Belief(0.0, 0.0, 40.0, CELL_M)
     belief.update((surface([(40.0, 0.0, 6.0), (-40.0, 0.0, 6.0)]),), 1.0)
