@@ -253,7 +253,8 @@ def _correlated(
     else:
         gsd_m = matcher.cell_m(view.agl_m, FIX_GSD_PER_AGL[describer.name])
         gsd_m, pool = bounded_cells(gsd_m, describer.stride, belief)
-        found = matcher.correlate_on(image, view, belief, hypotheses_of(view), gsd_m, pool, describer)
+        pyramid = matcher.pyramid(image, describer)
+        found = matcher.correlate_on(pyramid, view, belief, hypotheses_of(view), gsd_m, pool, describer)
     return found, (time.process_time() - began_s) * 1e3
 
 
