@@ -15,7 +15,6 @@ from terrafix.anchor.matching.frame_matcher import (
     Hypothesis,
     View,
     view_at,
-    without_colour,
 )
 from terrafix.core.camera import CameraCalibration, Mount
 from terrafix.core.geodesy import LocalFrame, rot_w_b
@@ -90,8 +89,8 @@ def reported_view(shot: Shot, origin: Origin) -> tuple[np.ndarray, View] | None:
 def _score(matcher: FrameMatcher, grey: np.ndarray, view: View, window: _Window, hypothesis: Hypothesis) -> float:
     """Highest standardised correlation of a frame in the window; 0 where it cannot be correlated."""
     turned = view_at(view, hypothesis, view.e_m, view.n_m)
-    grey, gsd_m = without_colour(grey, matcher.gradients), matcher.correlation_cell_m(turned.agl_m)
-    found = matcher.correlate_on(grey, turned, window, (AS_PREDICTED,), gsd_m)
+    pyramid, gsd_m = matcher.pyramid(grey, matcher.gradients), matcher.correlation_cell_m(turned.agl_m)
+    found = matcher.correlate_on(pyramid, turned, window, (AS_PREDICTED,), gsd_m)
     return max((float(np.nan_to_num(surface.z, nan=-np.inf).max()) for surface in found.surfaces), default=0.0)
 
 

@@ -112,6 +112,7 @@ class Localizer:
         self._place_test: PlaceTest | None = None  # while a drawn map is searched
         self._place_budget = FalseAlarmBudget()
         self._shape = ImageShape()
+        self._untested_weight = 0.0  # of the observations since the shape of the images was tested
         self._since_observation_m = np.inf  # motion since the last observation
         self._since_single_frame_m = np.inf  # motion since a place was last sought by the patches of one frame
         self._scale_matched = False  # the last frame had a pose at the predicted scale
@@ -331,13 +332,16 @@ class Localizer:
         return replace(view, scale_sigma=0.0) if matched and is_same_ground else view
 
     def _test_shape(self, seen: Observation, belief: Belief, hypothesis: Hypothesis, score: float) -> None:
-        """Updates the posterior of another shape of the images. ``hypothesis``, ``score``: of the best mode."""
-        if seen.layer.drawn or not self._shape.is_in_doubt(score):
+        """Updates the posterior of another shape of the images, after as much new ground as counts in full: the same
+        ground would give the same scores. ``hypothesis``, ``score``: of the best mode."""
+        self._untested_weight += seen.weight
+        if seen.layer.drawn or self._untested_weight < 1.0 or not self._shape.is_in_doubt(score):
             return
         scores = seen.layer.matcher.stretched_scores(seen.image, seen.view, belief, hypothesis, STRETCHES[1:])
         scores[AS_DESCRIBED] = seen.correlation.scores[seen.correlation.hypotheses.index(hypothesis)]
         if len(scores) == len(STRETCHES):
-            self._shape.add(scores, seen.weight)
+            self._shape.add(scores)
+            self._untested_weight %= 1.0
 
     @staticmethod
     def _has_passed(test: PlaceTest, mode: Mode, seen: Observation, score: float, evidence_nats: float) -> bool:

@@ -16,6 +16,7 @@ class GradientDescriber:
     channels = CHANNELS
     stride = 1  # image pixels per descriptor cell
     grayscale = True  # takes grey images
+    context_px = 8  # gradients and their blur reach six pixels
 
     def describe(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR, or (H, W) grey -> (CHANNELS, H, W) float32; the norm of each pixel's vector is below

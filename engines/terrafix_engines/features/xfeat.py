@@ -21,6 +21,7 @@ class XFeatDescriber:
 
     name = "xfeat"
     grayscale = False
+    context_px = 32  # cells at the border of a tile as in a larger image
 
     def __init__(self, model: Model, manifest: Manifest) -> None:
         """``model`` was opened with INPUTS and DESCRIPTORS_ONLY."""

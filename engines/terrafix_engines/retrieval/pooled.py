@@ -19,6 +19,7 @@ class DenseDescriber(Protocol):
     stride: int
     channels: int
     grayscale: bool
+    context_px: int
 
     def describe(self, image: np.ndarray) -> np.ndarray: ...
 
@@ -30,6 +31,7 @@ class PooledDescriber:
         self._dense, self._pool = dense, pool
         self.name = name or f"{dense.name}-mean-{pool}"
         self.stride, self.channels, self.grayscale = dense.stride * pool, dense.channels, dense.grayscale
+        self.context_px = -(-dense.context_px // self.stride) * self.stride
 
     def describe(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR, or (H, W) grey -> (channels, H // stride, W // stride) float32"""

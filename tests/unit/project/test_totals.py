@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[3]
 CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
-LINES = {"daemon": 41703, "engines": 1674, "tools": 64311, "tests": 69849}
-WORDS = 67242  # of all documents
+LINES = {"daemon": 41864, "engines": 1678, "tools": 64320, "tests": 69961}
+WORDS = 67956  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 

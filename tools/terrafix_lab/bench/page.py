@@ -33,7 +33,8 @@ STAGES = """## Stages and their floor
 
 The floor of a stage is the processor time inside of OpenCV functions that it calls, in another replay of the same
 run; the ratio is that of the sums over all frames. Estimator and smoother (iSAM2) have no such floor. Decoding
-is measured by the clock alone."""
+is measured by the clock alone. What the anchor takes beside it:
+[decision 075](decisions/075-a-frame-is-halved-before-it-is-rectified.md#left)."""
 
 Table = list[list[str]]  # the first row is the head
 

@@ -8,9 +8,6 @@ import numpy as np
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 
 TILE_CELLS_PX = 256  # pixels of a tile's side; a multiple of every stride [tuned]
-# pixels of context around a tile, so that descriptors at its border equal those of a larger image; a multiple of every
-# stride [tuned]
-TILE_PAD_PX = 32
 DESCRIPTOR_CACHE_BYTES = 33 * 1024 * 1024  # memory for the tiles of all layers, bytes: 31 tiles of gradients [tuned]
 # A float16 of the same sign, exponent and mantissa, moved to where a float32 has them: the sign has come with it in too
 # many copies, and the exponent is less than it should be by the difference of the two biases. [spec: IEEE 754]
@@ -34,6 +31,7 @@ class Describer(Protocol):
     stride: int
     channels: int
     grayscale: bool  # ``describe`` takes grey images (H, W) as well
+    context_px: int  # pixels around a cell on which its descriptor depends, a multiple of the stride
 
     def describe(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8 BGR -> (C, H // stride, W // stride) float32"""
@@ -45,13 +43,11 @@ class MapFeatures:
         source: MapWindows,
         describer: Describer,
         cache_bytes: int = DESCRIPTOR_CACHE_BYTES,
-        pad_px: int = TILE_PAD_PX,
         store: DescriptorStore | None = None,
     ) -> None:
         """``store``: file store in which tiles outlive this process."""
         self._source = source
         self.describer = describer
-        self._pad_px = pad_px
         self._store = store
         self._tiles: OrderedDict[tuple[float, int, int], tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._bytes, self._max_bytes = 0, cache_bytes
@@ -106,7 +102,7 @@ class MapFeatures:
         return tile
 
     def _computed(self, gsd_m: float, tx: int, ty: int, cell: float, per_tile: int) -> tuple[np.ndarray, np.ndarray]:
-        stride, pad_px = self.describer.stride, self._pad_px
+        stride, pad_px = self.describer.stride, self.describer.context_px
         side = TILE_CELLS_PX + 2 * pad_px
         image, ok = self._source.window(
             tx * per_tile * cell - pad_px * gsd_m, -ty * per_tile * cell + pad_px * gsd_m, side, side, gsd_m

@@ -13,7 +13,7 @@ import numpy as np
 from terrafix.anchor.matching.descriptor_cache import DESCRIPTOR_CACHE_BYTES, Describer, MapFeatures
 from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
-from terrafix.anchor.matching.orthorectify import Rectified, Relief, patch_centres, rays_to, rectify
+from terrafix.anchor.matching.orthorectify import Pyramid, Rectified, Relief, patch_centres, rays_to, rectify
 from terrafix.anchor.matching.patch_matcher import SearchedMap, match_patches
 from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_SLOPE, BELIEF_LLR_ZERO_Z, Surface
 from terrafix.core.camera import CameraCalibration
@@ -46,7 +46,7 @@ GSD_STEPS_PER_OCTAVE = 2  # Scales are rounded to this grid, so that the map's d
 # belief. [measured: docs/decisions/047-cells-of-a-look.md]
 MAX_WINDOW_CELLS = 640
 # Largest side of a cell of means, pixels: twice as many divide a tile of the map and its rim
-# [spec: descriptor_cache.TILE_PAD_PX]
+# [spec: Describer.context_px]
 MAX_STRIDE = 16
 # Hypotheses of yaw and scale of one look. Of more, cells twice as large select as many: between two of them the border
 # of a frame is several cells from its place anyway. [measured: docs/decisions/047-cells-of-a-look.md]
@@ -221,6 +221,8 @@ class FrameMatcher:
         self._describer = describer
         self._subset = 0
         self._features = MapFeatures(source, describer, cache_bytes, store=store)
+        self._image: Image | None = None  # the newest one, and its pyramids, in colour and in grey
+        self._pyramids: dict[bool, Pyramid] = {}
         self._by_pool: dict[tuple[str, int], MapFeatures] = {}
         self._cache_bytes, self._store = cache_bytes, store
         # Correlation is on gradients, and where the position is not known on weights of one's own as well. The model
@@ -264,16 +266,24 @@ class FrameMatcher:
         return None if is_level else above_m
 
     def rectify_all(
-        self, image: Image, view: View, hypotheses: Sequence[Hypothesis], gsd_m: float, stride: int
+        self, image: Image | Pyramid, view: View, hypotheses: Sequence[Hypothesis], gsd_m: float, stride: int
     ) -> list[Rectified | None]:
         """Orthorectified frames, one per hypothesis; None where the camera sees no ground."""
-        blurred: dict[float, Image] = {}
         relief = self.relief(view)
         turned = [view_at(view, one, view.e_m, view.n_m) for one in hypotheses]
         return [
-            rectify(image, self._stretched(one.stretch), at.r_w_c, at.agl_m, gsd_m, stride, blurred, relief)
+            rectify(image, self._stretched(one.stretch), at.r_w_c, at.agl_m, gsd_m, stride, relief)
             for one, at in zip(hypotheses, turned, strict=True)
         ]
+
+    def pyramid(self, image: Image, describer: Describer) -> Pyramid:
+        """Of ``image`` (H, W, 3), in grey if ``describer`` needs no colour; computed once for the newest image."""
+        if image is not self._image:
+            self._image, self._pyramids = image, {}
+        grey = describer.grayscale
+        if grey not in self._pyramids:
+            self._pyramids[grey] = Pyramid(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if grey else image)
+        return self._pyramids[grey]
 
     def _stretched(self, stretch: tuple[float, float]) -> CameraCalibration:
         return replace(self.camera, fx=stretch[0] * self.camera.fx, fy=stretch[1] * self.camera.fy)
@@ -290,7 +300,7 @@ class FrameMatcher:
         ground; empty: the window has no map data."""
         cells = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
         hypotheses = tuple(replace(hypothesis, stretch=stretch) for stretch in stretches)
-        found = self.correlate_on(without_colour(image, self.gradients), view, belief, hypotheses, *cells)
+        found = self.correlate_on(self.pyramid(image, self.gradients), view, belief, hypotheses, *cells)
         return {one.stretch: score for one, score in zip(found.hypotheses, found.scores, strict=True)}
 
     def correlate(self, image: Image, view: View, belief: SearchWindow) -> CorrelationResult:
@@ -300,17 +310,17 @@ class FrameMatcher:
         Verdict TOO_LOW: the frame covers too few cells or sees no ground; OUTSIDE_MAP: no map data in the window.
         """
         hypotheses = self._next_subset(hypotheses_of(view))
-        grey = without_colour(image, self.gradients)
+        pyramid = self.pyramid(image, self.gradients)
         gsd, pool = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
         # Of a drawn map, which says little, every hypothesis counts: the belief itself searches it. Its lines are as
         # clear on larger pixels.
         if self._drawn:
-            return self.correlate_on(grey, view, belief, hypotheses, gsd * pool)
+            return self.correlate_on(pyramid, view, belief, hypotheses, gsd * pool)
         if len(hypotheses) > MAX_FINE_HYPOTHESES:
-            coarse = self.correlate_on(grey, view, belief, hypotheses, gsd, 2 * pool)
+            coarse = self.correlate_on(pyramid, view, belief, hypotheses, gsd, 2 * pool)
             if coarse.verdict is Verdict.ACCEPTED:
                 hypotheses = coarse.best_hypotheses(MAX_FINE_HYPOTHESES)
-        found = self.correlate_on(grey, view, belief, hypotheses, gsd, pool)
+        found = self.correlate_on(pyramid, view, belief, hypotheses, gsd, pool)
         # [measured: docs/decisions/074-weights-that-ship.md]
         if self._describer.name != OWN or view.sigma_m < RELIEF_SIGMA * view.agl_m:
             return found
@@ -322,11 +332,12 @@ class FrameMatcher:
         """``correlate`` with the descriptors of the model."""
         gsd = self.cell_m(view.agl_m, FIX_GSD_PER_AGL[self._describer.name])
         cells = bounded_cells(gsd, self._describer.stride, belief)
-        return self.correlate_on(image, view, belief, hypotheses, *cells, self._describer)
+        pyramid = self.pyramid(image, self._describer)
+        return self.correlate_on(pyramid, view, belief, hypotheses, *cells, self._describer)
 
     def correlate_on(
         self,
-        image: Image,
+        image: Pyramid,
         view: View,
         belief: SearchWindow,
         hypotheses: tuple[Hypothesis, ...],
@@ -410,8 +421,7 @@ class FrameMatcher:
     ) -> PatchFix | None:
         gsd = self.cell_m(view.agl_m, FIX_GSD_PER_AGL[describer.name])
         cell = gsd * describer.stride
-        image = without_colour(image, describer)
-        (frame,) = self.rectify_all(image, view, (AS_PREDICTED,), gsd, describer.stride)
+        (frame,) = self.rectify_all(self.pyramid(image, describer), view, (AS_PREDICTED,), gsd, describer.stride)
         if frame is None:
             return None
         radius = max(int(np.ceil(radius_share * view.agl_m / cell)), 3)
@@ -514,11 +524,6 @@ def levelled_view(view: View, fix: PatchFix) -> View:
         tilt_sigma_rad=view.tilt_sigma_rad,
     )
     return view_of_fix(view, fix if fit is None else replace(fix, pnp=replace(fix.pnp, fit=fit)))
-
-
-def without_colour(image: Image, describer: Describer) -> Image:
-    """``image`` (H, W, 3) in grey (H, W) if ``describer`` needs no colour: it is rectified in a third of the time."""
-    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if describer.grayscale else image
 
 
 def _describe(frame: Rectified, describer: Describer) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,8 @@ from terrafix.core.node import Image
 MAX_GROUND_DISTANCE = 1.6
 # smallest cosine between optical axis and vertical: that limit with a margin for the image corners [tuned]
 MIN_AXIS_DOWN = 0.3
+# Pixels of the image in one of the rectified image from which on it is smoothed. [tuned]
+SMOOTHED_SHRINK = 1.4
 # Pixels of the rectified image between two that a lens with distortion is evaluated for; between them it is
 # interpolated, to a twentieth of a rectified pixel for a k1 of -0.2. [measured: test_orthorectify]
 LENS_STEP_PX = 4
@@ -23,6 +25,22 @@ OUTSIDE_PX = -1e6  # of ground behind the camera, so that no interpolated pixel 
 # Metres (N,) by which the ground rises above the plane of projection, at points (N, 2), east and north [m] of the one
 # below the camera.
 Relief = Callable[[np.ndarray], np.ndarray]
+
+
+class Pyramid:
+    """An image, in colour or grey, and its halves, each computed when it is first needed."""
+
+    def __init__(self, image: Image) -> None:
+        self._levels = [image]
+
+    def level(self, halvings: int) -> Image:
+        """The image, halved so many times; of an odd side without its last pixel."""
+        while len(self._levels) <= halvings:
+            finer = self._levels[-1]
+            height, width = (side // 2 for side in finer.shape[:2])
+            even = finer[: 2 * height, : 2 * width]
+            self._levels.append(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA))
+        return self._levels[halvings]
 
 
 @dataclass(frozen=True)
@@ -52,18 +70,16 @@ def footprint(camera: CameraCalibration, r_w_c: np.ndarray, agl_m: float) -> tup
 
 
 def rectify(
-    image: Image,
+    image: Image | Pyramid,
     camera: CameraCalibration,
     r_w_c: np.ndarray,
     agl_m: float,
     gsd_m: float,
     stride: int = 1,
-    blurred: dict[float, Image] | None = None,
     relief: Relief | None = None,
 ) -> Rectified | None:
     """Projects ``image``, in colour or grey, on the ground: ``relief`` over a plane ``agl_m`` below the camera, or that
-    plane. Sides are multiples of ``stride`` pixels. ``blurred``: cache of blurred copies of the image by scale factor,
-    shared between yaw hypotheses. None: no ground is visible."""
+    plane. Sides are multiples of ``stride`` pixels. None: no ground is visible."""
     box = footprint(camera, r_w_c, agl_m)
     if box is None:
         return None
@@ -73,21 +89,25 @@ def rectify(
     height = int(np.ceil((n_max - n_min) / cell)) * stride
     ground = np.array([[gsd_m, 0.0, e_min + 0.5 * gsd_m], [0.0, -gsd_m, n_max - 0.5 * gsd_m], [0.0, 0.0, -agl_m]])
     shrink = gsd_m / (agl_m / camera.fx)
-    source = image
-    if shrink > 1.4:  # anti-aliasing
-        blurred = {} if blurred is None else blurred
-        if shrink not in blurred:
-            blurred[shrink] = cv2.GaussianBlur(image, (0, 0), 0.35 * shrink)
-        source = blurred[shrink]
+    pyramid = image if isinstance(image, Pyramid) else Pyramid(image)
+    # Against aliasing, of a half of the image where it is as fine as needed, which takes a tenth of the time.
+    halvings = int(np.log2(np.clip(shrink / SMOOTHED_SHRINK, 1.0, min(pyramid.level(0).shape[:2]))))
+    source, share = pyramid.level(halvings), 0.5**halvings
+    if shrink > SMOOTHED_SHRINK:
+        source = cv2.GaussianBlur(source, (0, 0), 0.35 * share * shrink)
+    rows, columns = source.shape[:2]
     if camera.distortion or camera.radial_k1 or camera.readout is not None or relief is not None:
-        px = _lens_map(camera, r_w_c, ground, (height, width), relief)
-        flat, (x, y) = cv2.remap(source, px, None, cv2.INTER_LINEAR), np.moveaxis(px, -1, 0)
-        mask = (x >= 0) & (y >= 0) & (x <= camera.width - 1) & (y <= camera.height - 1)
+        px = _lens_map(camera, r_w_c, ground, (height, width), share, relief)
+        x, y = px[..., 0], px[..., 1]
+        flat = cv2.remap(source, x, y, cv2.INTER_LINEAR)
+        mask = (x >= 0) & (y >= 0) & (x <= columns - 1) & (y <= rows - 1)
     else:
-        matrix = camera.matrix() @ (r_w_c.T @ ground)
+        offset = 0.5 * share - 0.5  # pixel 0 spans -0.5 to 0.5
+        halved = np.array([[share, 0.0, offset], [0.0, share, offset], [0.0, 0.0, 1.0]])
+        matrix = halved @ camera.matrix() @ (r_w_c.T @ ground)
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         flat = cv2.warpPerspective(source, matrix, (width, height), flags=how)
-        white = np.full(image.shape[:2], 255, np.uint8)
+        white = np.full((rows, columns), 255, np.uint8)
         mask = cv2.warpPerspective(white, matrix, (width, height), flags=how) > 250
     return Rectified(flat, mask, e_min, n_max, gsd_m)
 
@@ -116,10 +136,16 @@ def rays_to(ground_m: np.ndarray, agl_m: float, r_w_c: np.ndarray, relief: Relie
 
 
 def _lens_map(
-    camera: CameraCalibration, r_w_c: np.ndarray, ground: np.ndarray, sides: tuple[int, int], relief: Relief | None
+    camera: CameraCalibration,
+    r_w_c: np.ndarray,
+    ground: np.ndarray,
+    sides: tuple[int, int],
+    share: float,
+    relief: Relief | None,
 ) -> np.ndarray:
-    """(height, width, 2) float32: pixel of the frame at each rectified pixel, far outside of it for ground behind the
-    camera. ``ground`` (3, 3): rectified pixel (x, y, 1) -> point of the plane; ``sides``: height and width."""
+    """(height, width, 2) float32: pixel of the frame, reduced to ``share`` of its sides, at each rectified pixel, far
+    outside of it for ground behind the camera. ``ground`` (3, 3): rectified pixel (x, y, 1) -> point of the plane;
+    ``sides``: height and width."""
     rows, columns = (side // LENS_STEP_PX + 2 for side in sides)
     x, y = np.meshgrid(np.arange(columns) * float(LENS_STEP_PX), np.arange(rows) * float(LENS_STEP_PX))
     pixels = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
@@ -128,7 +154,7 @@ def _lens_map(
         rays += relief(pixels @ ground[:2].T)[:, None] * r_w_c[2]
     behind = rays[:, 2] <= 0
     rays[behind] = (0.0, 0.0, 1.0)
-    px = camera.project(rays)
+    px = share * (camera.project(rays) + 0.5) - 0.5
     px[behind] = OUTSIDE_PX
     coarse = px.reshape(rows, columns, 2).astype(np.float32)
     return interpolated(coarse, LENS_STEP_PX, *sides)

@@ -12,9 +12,6 @@ from terrafix.anchor.matching.descriptor_cache import Describer, MapFeatures, Ma
 from terrafix.map.descriptor_table import StoredDescriptors
 from terrafix.map.package import LocalMap
 
-# pixels of context of a tile: gradients and their blur reach six pixels; small, because a whole map has many tile
-# borders [tuned]
-COARSE_TILE_PAD_PX = 8
 # largest distance in octaves between the wanted scale and a stored one; beyond it descriptors are computed [tuned]
 MAX_OCTAVES = 0.6
 
@@ -23,7 +20,7 @@ class CoarseDescriptors:
     """Same interface as ``MapFeatures``, for pixel sizes from ``gsd_m(wanted)`` only."""
 
     def __init__(self, source: MapWindows, describer: Describer) -> None:
-        self._computed = MapFeatures(source, describer, pad_px=COARSE_TILE_PAD_PX)
+        self._computed = MapFeatures(source, describer)
         self._stored = source.descriptors(describer.name) if isinstance(source, LocalMap) else None
 
     def gsd_m(self, wanted_m: float) -> float:

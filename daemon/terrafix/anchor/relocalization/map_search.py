@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View, without_colour
+from terrafix.anchor.matching.frame_matcher import FrameMatcher, Hypothesis, View
 from terrafix.anchor.matching.ncc import standardise
 from terrafix.anchor.place_index.recognizer import PlaceRecognizer
 from terrafix.anchor.relocalization.block_search import BLOCK_CELLS, Block, BlockCorrelator, blocks_of, select_blocks
@@ -174,7 +174,7 @@ class MapSearch:
         if not self._blocks:
             self._initialize(view)
         stride = self._correlator.stride
-        grey = without_colour(image, self._matcher.gradients)
+        grey = self._matcher.pyramid(image, self._matcher.gradients)
         frames = self._matcher.rectify_all(grey, view, self._hypotheses, self._cell_m / stride, stride)
         templates = [self._correlator.describe(frame) for frame in frames if frame is not None]
         if len(templates) < len(frames):

@@ -48,15 +48,14 @@ class ImageShape:
         """Whether a frame with this standardised correlation, as described, is to be tested."""
         return score < DOUBTFUL_SCORE or any(odds > -CERTAIN for odds in self._log_odds.values())
 
-    def add(self, scores: Mapping[Stretch, float], weight: float) -> None:
-        """``scores``: highest standardised correlation of a frame with each of STRETCHES; ``weight``: 0..1, as in
-        ``Belief.update``."""
+    def add(self, scores: Mapping[Stretch, float]) -> None:
+        """``scores``: highest standardised correlation of a frame with each of STRETCHES."""
         self._tested = True
         as_described = max(scores[one] for one in SAME_SHAPE)
         for ratio, shapes in OTHER_SHAPES.items():
             nats = BELIEF_LLR_SLOPE * (max(scores[one] for one in shapes) - as_described - LEAD)
             bounded = float(np.clip(nats, -BELIEF_LLR_MAX, BELIEF_LLR_MAX))
-            self._agreements[ratio].add(Cause.DESCRIPTION, weight * bounded)
+            self._agreements[ratio].add(Cause.DESCRIPTION, bounded)
         ratio, log_odds = max(self._log_odds.items(), key=lambda item: item[1])
         if log_odds >= CERTAIN:
             self.ratio = ratio

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import (
+    AS_PREDICTED,
     FIX_GSD_PER_AGL,
     PATCH_PER_AGL,
     PATCH_STEP,
@@ -13,12 +13,10 @@ from terrafix.anchor.matching.frame_matcher import (
     PatchFix,
     View,
     view_of_fix,
-    without_colour,
 )
-from terrafix.anchor.matching.orthorectify import patch_centres, rays_to, rectify
+from terrafix.anchor.matching.orthorectify import patch_centres, rays_to
 from terrafix.anchor.matching.patch_matcher import correlate_patches
 from terrafix.anchor.verification.patch_consensus import MAX_LLR, PatchConsensus, estimate_consensus
-from terrafix.core.camera import CameraCalibration
 from terrafix.core.node import Image
 from terrafix.core.pnp import PNP_MIN_INLIERS, SEARCH_RADIUS, PnpResult
 from terrafix.core.pose import fit_pose
@@ -47,8 +45,6 @@ class VerifiedPlace:
 class PlaceVerifier:
     def __init__(self, matcher: FrameMatcher) -> None:
         self._matcher = matcher
-        self._image: Image | None = None
-        self._reduced_frame: tuple[Image, CameraCalibration] | None = None
 
     def verify(
         self,
@@ -62,9 +58,8 @@ class PlaceVerifier:
         """``view``: proposed position, yaw and height above ground. ``tilt_prior``: the pose is regularised towards the
         tilt of the view. None: too few patches lie on the map."""
         cell_m = self._matcher.cell_m(view.agl_m, cell_per_agl)
-        reduced, camera = self._reduced(image, view.agl_m)
-        relief = self._matcher.relief(view)
-        frame = rectify(reduced, camera, view.r_w_c, view.agl_m, cell_m, relief=relief)
+        pyramid = self._matcher.pyramid(image, self._matcher.gradients)
+        (frame,) = self._matcher.rectify_all(pyramid, view, (AS_PREDICTED,), cell_m, 1)
         if frame is None:
             return None
         radius, patch = round(radius_per_agl * view.agl_m / cell_m), round(PATCH_PER_AGL * view.agl_m / cell_m)
@@ -79,7 +74,7 @@ class PlaceVerifier:
         row0 = round((n_max_m - (view.n_m + frame.n_max_m)) / cell_m)
         column0 = round((view.e_m + frame.e_min_m - e_min_m) / cell_m)
         template = self._matcher.gradients.describe(frame.image)
-        centres = patch_centres(camera, view.r_w_c, view.agl_m, frame, cell_m, PATCH_STEP)
+        centres = patch_centres(self._matcher.camera, view.r_w_c, view.agl_m, frame, cell_m, PATCH_STEP)
         corners, _, surfaces = correlate_patches(
             template, frame.mask, window, valid, patch, radius, row0, column0, centres
         )
@@ -94,7 +89,7 @@ class PlaceVerifier:
         )
         tilt_sigma_rad = view.tilt_sigma_rad if tilt_prior else None
         found_m = on_map_m + found.offsets * view.agl_m
-        rays = rays_to(ground_m, view.agl_m, view.r_w_c, relief)
+        rays = rays_to(ground_m, view.agl_m, view.r_w_c, self._matcher.relief(view))
         return VerifiedPlace(found, self._pose(view, rays, found_m, found, cell_m, tilt_sigma_rad))
 
     def refine(self, image: Image, view: View, first: PatchFix) -> PatchFix | None:
@@ -104,16 +99,6 @@ class PlaceVerifier:
             image, view_of_fix(view, first), FIX_GSD_PER_AGL["gradient"], SEARCH_RADIUS, tilt_prior=False
         )
         return None if found is None else replace(found.fix, refined=True)
-
-    def _reduced(self, image: Image, agl_m: float) -> tuple[Image, CameraCalibration]:
-        """The frame reduced to about two pixels per fine cell, computed once for all places."""
-        if self._reduced_frame is None or image is not self._image:
-            fine_m = self._matcher.cell_m(agl_m, FINE_PLACE_CELL_PER_AGL)
-            camera = self._matcher.camera.scaled(min(2.0 * (agl_m / self._matcher.camera.fx) / fine_m, 1.0))
-            size = (camera.width, camera.height)
-            grey = without_colour(image, self._matcher.gradients)
-            self._image, self._reduced_frame = image, (cv2.resize(grey, size, interpolation=cv2.INTER_AREA), camera)
-        return self._reduced_frame
 
     def _pose(
         self,

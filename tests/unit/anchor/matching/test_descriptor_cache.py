@@ -19,7 +19,7 @@ class Tiles:
 class Numbers:
     """Descriptors of two channels, other ones for each tile."""
 
-    name, stride, channels, grayscale = "numbers", 8, 2, False
+    name, stride, channels, grayscale, context_px = "numbers", 8, 2, False, 32
 
     def __init__(self) -> None:
         self.described = 0

@@ -62,17 +62,15 @@ def matcher(ground: np.ndarray) -> FrameMatcher:
     return FrameMatcher(PINHOLE, FlatMap(ground), GradientDescriber())  # type: ignore[arg-type]
 
 
-def test_a_frame_is_blurred_once_for_all_yaw_hypotheses(
+def test_a_frame_is_halved_once_for_all_looks(
     matcher: FrameMatcher, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alone = [matcher.rectify_all(frame, predicted_view(), [Hypothesis(0.3 * k, 1.0)], 2.0, 1)[0] for k in range(5)]
-    blur, calls = cv2.GaussianBlur, []
-    monkeypatch.setattr(cv2, "GaussianBlur", lambda *a: calls.append(a) or blur(*a))
-    together = matcher.rectify_all(frame, predicted_view(), [Hypothesis(0.3 * k, 1.0) for k in range(5)], 2.0, 1)
-    assert len(calls) == 1
-    for one, other in zip(alone, together, strict=True):
-        assert one is not None and other is not None
-        assert np.array_equal(one.image, other.image) and np.array_equal(one.mask, other.mask)
+    halve, calls = cv2.resize, list[tuple[int, ...]]()
+    monkeypatch.setattr(cv2, "resize", lambda *a, **k: calls.append(a[0].shape) or halve(*a, **k))
+    for turned in range(5):
+        pyramid = matcher.pyramid(frame, matcher.gradients)
+        matcher.rectify_all(pyramid, predicted_view(), [Hypothesis(0.3 * turned, 1.0)], 4.0, 1)
+    assert len(calls) >= 2 and len(calls) == len(set(calls))
 
 
 # --- the grid of hypotheses -----------------------------------------------------------------------
@@ -289,7 +287,7 @@ def test_a_wrong_position_gives_no_pose(matcher: FrameMatcher, frame: np.ndarray
 class Learned:
     """Stand-in for a learned model with coarse cells; counts its calls."""
 
-    name, stride, channels, grayscale = "xfeat", 8, 16, False
+    name, stride, channels, grayscale, context_px = "xfeat", 8, 16, False, 32
 
     def __init__(self) -> None:
         self.calls = 0
