@@ -7,7 +7,7 @@ between two retained ones are eliminated exactly, and their positions depend on 
 A node is retained where it separates the graph: a keyframe does, but for the three-view factor of which it is the
 middle one, which is dropped. (Retaining the keyframe before it as well was tried: the covariances of a chain in which
 each pair of nodes depends on another pair are lost in rounding.) When too many nodes are retained, some of them are
-eliminated. So the time per frame is constant, and the memory grows by some 520 bytes a frame."""
+eliminated. So the time per frame is constant, and the memory grows by some 630 bytes a frame."""
 
 from bisect import bisect_left, bisect_right
 from contextlib import suppress

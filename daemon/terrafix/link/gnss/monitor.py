@@ -75,7 +75,12 @@ class GnssMonitor:
             before = predict_to(self._estimate, estimate.t_ns, inertial)
             step_m = distance_m(before.lat_deg, before.lon_deg, estimate.lat_deg, estimate.lon_deg)
             self._own_steps.append((estimate.t_ns, step_m))
+            self._forget_steps(estimate.t_ns)  # without readings, too
         self._estimate = estimate
+
+    def _forget_steps(self, now_ns: int) -> None:
+        while self._own_steps and now_ns - self._own_steps[0][0] > OWN_STEP_MEMORY_NS:
+            self._own_steps.popleft()
 
     def on_vehicle_state(self, state: VehicleState) -> None:
         self._armed = state.armed
@@ -87,8 +92,7 @@ class GnssMonitor:
         if self._mode == "off":
             return
         detector = self._detectors.setdefault(reading.receiver, SpoofingDetector())
-        while self._own_steps and reading.t_ns - self._own_steps[0][0] > OWN_STEP_MEMORY_NS:
-            self._own_steps.popleft()
+        self._forget_steps(reading.t_ns)
         own_step_m = max((step_m for _, step_m in self._own_steps), default=0.0)
         vision = self._vision_at_reading(reading.t_ns, inertial)
         assessment = detector.update(reading, vision, own_step_m)
