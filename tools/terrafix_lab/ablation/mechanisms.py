@@ -29,12 +29,12 @@ def _returns(value: Any = None) -> Callable[..., Any]:
     return lambda *_, **__: value
 
 
-def _believe(images: Any, frame: Any) -> None:
+def _join(images: Any, frame: Any) -> None:
     frame.fragment.join()
     images.end()
 
 
-def _confirm(fragment: Any, _t_s: float, _evidence: Any, *, only_by_place: bool = False) -> None:
+def _confirm(fragment: Any, _t_s: float, _evidence: Any, *, by_duration: bool = True) -> None:
     fragment.frames += 1
     fragment.join()
 
@@ -62,7 +62,7 @@ MECHANISMS: dict[str, Mechanism] = {
     "modes": Mechanism(f"{_INTEGRITY}.position_hypotheses", "PositionHypotheses", {"update_modes": _returns()}),
     "fragments": Mechanism(f"{_INTEGRITY}.fragments", "Fragment", {"add_frame": _confirm}),
     "hits": Mechanism(f"{_INTEGRITY}.fragments", "MapHitRate", {"update": _returns()}),
-    "contradicted": Mechanism(f"{_INTEGRITY}.fragments", "ContradictedImages", {"on_map_match": _believe}),
+    "contradicted": Mechanism(f"{_INTEGRITY}.contradicted_images", "ContradictedImages", {"on_map_match": _join}),
     "correlation": Mechanism(f"{_INTEGRITY}.correlated_fixes", "CorrelatedFixes", {"information_share": _returns(1.0)}),
     "static": Mechanism(f"{_INTEGRITY}.static_picture", "StaticPicture", {"is_frozen": _returns(False)}),
     "signs": Mechanism(f"{_INTEGRITY}.signed_innovations", "SignedInnovations", {"add": _returns()}),
