@@ -39,20 +39,17 @@ P_REJECTED, P_REJECTED_OTHER_GROUND = 0.1, 0.9
 P_NOTHING, P_NOTHING_DESCRIPTION = 0.2, 0.99
 # ... and over ground that the map does not show, where one in five gives a pose. [measured: docs/monte-carlo.md]
 P_NOTHING_OTHER_GROUND = 0.8
-# Evidence of a pose by its number of inliers. On nine flights and maps a pose was found at 70 right places in 25 to 90
-# % of the frames, with 20 inliers in the median, and at 930 wrong places in 0.5 %, with 9 to 11 inliers (one had 20).
-# [measured: docs/search.md]
-POSE_LLR = ((8, 3.0), (12, 5.0), (20, 6.0))  # (inliers, nats)
 # Heights of new ground over which a repeating pattern becomes less probable by 1/e: its length. [tuned]
 PATTERN_HEIGHTS = 5.0
 
-# Rows: for a unit of new ground, which for ELSEWHERE is one height above ground, for START and DESCRIPTION one
-# correlation over other ground than before. For OTHER_GROUND poses count by their inliers (``pose_llr``) and by how far
-# away they could be, and correlations without one by the hit rate of the flight: over bare ground they are frequent
-# (estimator/integrity/other_ground.py).
+# Rows: for a unit of new ground, which for ELSEWHERE is one height above ground, for OTHER_GROUND the share of the pose
+# that is independent of those before (correlated_fixes.py), for START and DESCRIPTION one correlation over other ground
+# than before. Correlations without a pose count for OTHER_GROUND by the hit rate of the flight (other_ground.py): over
+# bare ground they are frequent.
 NATS: dict[Observed, dict[Cause, float]] = {
     Observed.POSE: {
         Cause.ELSEWHERE: -1.0 / PATTERN_HEIGHTS,
+        Cause.OTHER_GROUND: math.log((1.0 - P_REJECTED_OTHER_GROUND) / (1.0 - P_REJECTED)),
         Cause.START: -math.inf,  # from then on the map has the position
         Cause.DESCRIPTION: math.log((1.0 - P_NOTHING_DESCRIPTION) / (1.0 - P_NOTHING)),
     },
@@ -136,9 +133,3 @@ class Agreement:
         odds = {cause: math.exp(log_odds - largest) for cause, log_odds in self.log_odds.items()}
         total = math.exp(-largest) + sum(odds.values())
         return {cause: one / total for cause, one in odds.items()}
-
-
-def pose_llr(inliers: int) -> float:
-    """Log likelihood ratio [nats] of a camera pose with so many inliers: of the ground that the map shows there against
-    other ground. 0: of a pose that is not by inliers."""
-    return max((llr for fewest, llr in POSE_LLR if inliers >= fewest), default=0.0)

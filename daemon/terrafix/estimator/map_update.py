@@ -191,8 +191,7 @@ class MapUpdate:
         off = None if match.position_only else measurement.position_innovation(*predicted)
         contradicted = state.contradicted_images.active
         if not match.position_only:
-            inliers = 0 if match.pose is not None else match.inliers
-            self.hypotheses.other_ground.on_pose(share, position, height_m, inliers)
+            self.hypotheses.other_ground.on_pose(share, position, height_m)
             self._learn_from_pose(match, node, before, measurement)
             alone = replace(measurement, information_share=1.0)
             self._weigh_fragment(node, levelled(alone, *predicted))

@@ -7,7 +7,7 @@ the belief as a whole is lower at a wrong position, and no camera pose is found.
 
 import math
 
-from terrafix.core.agreement import Agreement, Cause, Range, pose_llr
+from terrafix.core.agreement import Agreement, Cause, Range
 
 START_LOG_ODDS = 6.0  # log odds of a start coordinate: one in 400 is wrong by far more than its 1-sigma [tuned]
 # upper bound for a position confirmed by poses; bare ground or an outdated map may follow for a kilometre [tuned]
@@ -19,6 +19,10 @@ LOCK_NULL_GAIN = 3.0
 # the next one over the same kind of ground is not independent: a copter that climbed over fields was right through six
 # full observations of -2, and twice as many must not outweigh a start. [measured: this comment]
 MIN_GAIN, MAX_GAIN = -0.4, 2.0
+# Evidence of a pose by its number of inliers. On nine flights and maps a pose was found at 70 right places in 25 to 90
+# % of the frames, with 20 inliers in the median, and at 930 wrong places in 0.5 %, with 9 to 11 inliers (one had 20).
+# [measured: docs/search.md]
+POSE_LLR = ((8, 3.0), (12, 5.0), (20, 6.0))  # (inliers, nats)
 # share of the height, and metres: a position whose 1-sigma exceeds both is not tested [tuned]
 WIDE_SIGMA, WIDE_SIGMA_M = 0.5, 40.0
 
@@ -55,10 +59,15 @@ class LockMonitor:
         """
         is_wide = has_wide_sigma(sigma_m, agl_m)
         least, most = (0.0, START_LOG_ODDS) if is_wide else (MIN_GAIN * new, MAX_LOG_ODDS)
-        gain = min(max(evidence_nats - LOCK_NULL_GAIN * weight, least), MAX_GAIN * weight) + weight * pose_llr(inliers)
+        gain = min(max(evidence_nats - LOCK_NULL_GAIN * weight, least), MAX_GAIN * weight) + weight * pose_gain(inliers)
         self.agreement.begin(Cause.ELSEWHERE, -min(self.log_odds + gain, most))
 
 
 def has_wide_sigma(sigma_m: float, agl_m: float) -> bool:
     """Whether the 1-sigma of a position is so large that evidence against the position is not counted."""
     return sigma_m > max(WIDE_SIGMA * agl_m, WIDE_SIGMA_M)
+
+
+def pose_gain(inliers: int) -> float:
+    """Log likelihood ratio "here against elsewhere" of a pose with so many inliers."""
+    return max((llr for fewest, llr in POSE_LLR if inliers >= fewest), default=0.0)

@@ -13,7 +13,6 @@ from terrafix.core.agreement import (
     Agreement,
     Cause,
     Observed,
-    pose_llr,
 )
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.monitors.registration import REGISTRATION_SPACING_HEIGHTS
@@ -54,20 +53,21 @@ class OtherGround:
             # A hit rate below that over other ground is one of other ground.
             self.agreement.add(Cause.OTHER_GROUND, max(math.log(P_NOTHING_OTHER_GROUND / p_nothing), 0.0))
 
-    def on_pose(self, information_share: float, position: Innovation, height_m: float, inliers: int) -> None:
+    def on_pose(self, information_share: float, position: Innovation, height_m: float) -> None:
         """A camera pose that was fused, weighted by the share 0..1 of the ground in it that is new. ``position``: the
         innovation of its position, with the tilt that was predicted. Poses of a wrong map are as far away as the
-        rejected ones; a gate that is wider than that accepts them too, and only ``inliers`` say something, as they do
-        of those that are outside of it. Where they are wrong, the vehicle is where it was predicted without them."""
+        rejected ones; a gate that is wider than that accepts them too, and its poses say nothing, as those that are
+        outside of it do. Where they are wrong, the vehicle is where it was predicted without them."""
         if not position.is_accepted:
             return
         reach2_m2 = position.limit * math.sqrt(max(float(np.linalg.det(position.covariance)), 0.0))
         in_gate = 1.0 - math.exp(-reach2_m2 / (self._offset2_m2 or (WRONG_POSE_HEIGHTS * height_m) ** 2))
-        in_gate = max(in_gate, 1.0 - P_REJECTED_OTHER_GROUND)
-        nats = min(math.log(in_gate / (1.0 - P_REJECTED)), 0.0) - pose_llr(inliers)
-        self.agreement.add(Cause.OTHER_GROUND, information_share * nats)
         if in_gate > 1.0 - P_REJECTED_OTHER_GROUND:
+            nats = min(math.log(in_gate / (1.0 - P_REJECTED)), 0.0)
+            self.agreement.add(Cause.OTHER_GROUND, information_share * nats)
             off_m = position.residual
             self._offset2_m2 = max(self._offset2_m2, float(off_m @ off_m + np.trace(position.covariance)))
+        else:
+            self.agreement.observe(Observed.POSE, Cause.OTHER_GROUND, information_share)
         if self.agreement.log_odds[Cause.OTHER_GROUND] <= RANGES[Cause.OTHER_GROUND].least:
             self._offset2_m2 = 0.0

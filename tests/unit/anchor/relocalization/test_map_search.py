@@ -26,10 +26,9 @@ from terrafix.anchor.verification.hypothesis_tracker import (
     _mahalanobis2,
     evidence,
 )
-from terrafix.anchor.verification.lock_monitor import MAX_LOG_ODDS, LockMonitor
+from terrafix.anchor.verification.lock_monitor import MAX_LOG_ODDS, LockMonitor, pose_gain
 from terrafix.anchor.verification.patch_consensus import PatchConsensus
 from terrafix.anchor.verification.patch_null import COARSE_NULL, PRIOR_PLACES, REFERENCE_PATCHES, PatchNull
-from terrafix.core.agreement import pose_llr
 from terrafix.map.null_model import DEFAULT_NULL, FalseAlarmBudget, NullRow
 from terrafix.messages import SearchStep
 from terrafix_engines.features.gradient import GradientDescriber
@@ -390,7 +389,7 @@ def test_without_other_active_tracks_the_null_model_is_estimated_from_inactive_o
 
 
 def test_more_patches_give_more_evidence() -> None:
-    assert pose_llr(7) == 0.0 < pose_llr(8) < pose_llr(12) < pose_llr(20) == pose_llr(48)
+    assert pose_gain(7) == 0.0 < pose_gain(8) < pose_gain(12) < pose_gain(20) == pose_gain(48)
 
 
 # --- lock monitor ---------------------------------------------------------------------------------

@@ -12,8 +12,9 @@ from terrafix.anchor.verification.lock_monitor import (
     START_LOG_ODDS,
     LockMonitor,
     has_wide_sigma,
+    pose_gain,
 )
-from terrafix.core.agreement import Cause, pose_llr
+from terrafix.core.agreement import Cause
 
 AGL_M, SIGMA_M = 100.0, 5.0
 
@@ -43,7 +44,7 @@ def test_a_sigma_is_wide_above_both_forty_metres_and_half_the_height(sigma_m: fl
     ("inliers", "nats"), [(0, 0.0), (7, 0.0), (8, 3.0), (11, 3.0), (12, 5.0), (19, 5.0), (20, 6.0), (300, 6.0)]
 )
 def test_more_inliers_are_more_evidence(inliers: int, nats: float) -> None:
-    assert pose_llr(inliers) == nats
+    assert pose_gain(inliers) == nats
 
 
 def test_an_observation_counts_by_its_gain_above_the_null_hypothesis_within_bounds() -> None:

@@ -10,7 +10,6 @@ from terrafix.estimator.integrity.other_ground import OtherGround
 
 OFFSET_M = np.array([90.0, -120.0])  # 150 m
 HEIGHT_M = 100.0
-BY_CONSENSUS = 0  # inliers of a pose by all patches together
 NEAR_M = np.array([2.0, -1.0])
 NARROW_M2 = 5.0**2 * np.eye(2)  # innovation covariance of an estimate that is placed
 
@@ -49,7 +48,7 @@ def test_a_map_with_a_tenth_of_wrong_poses_is_not_taken_for_another_place(seed: 
         if rng.uniform() < 0.1:
             consistency.on_rejected(OFFSET_M)
         else:
-            consistency.on_pose(0.5, innovation(NEAR_M, NARROW_M2), HEIGHT_M, BY_CONSENSUS)
+            consistency.on_pose(0.5, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
         inflated += consistency.variance_m2 > 0.0
     assert inflated < 0.1 * 500
 
@@ -57,8 +56,8 @@ def test_a_map_with_a_tenth_of_wrong_poses_is_not_taken_for_another_place(seed: 
 def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
     hovering, flying = (after_rejected(OtherGround(Agreement()), 4) for _ in range(2))
     for _ in range(10):
-        hovering.on_pose(0.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M, BY_CONSENSUS)
-        flying.on_pose(0.5, innovation(NEAR_M, NARROW_M2), HEIGHT_M, BY_CONSENSUS)
+        hovering.on_pose(0.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
+        flying.on_pose(0.5, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
     assert probability(hovering) == probability(after_rejected(OtherGround(Agreement()), 4))
     assert flying.variance_m2 == 0.0
 
@@ -66,7 +65,7 @@ def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
 def test_the_distance_of_earlier_rejected_poses_is_forgotten_after_accepted_ones() -> None:
     consistency = after_rejected(OtherGround(Agreement()), 1)
     for _ in range(20):
-        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M, BY_CONSENSUS)
+        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
     for _ in range(4):
         consistency.on_rejected(0.1 * OFFSET_M)
     assert consistency.variance_m2 == pytest.approx(probability(consistency) * 15.0**2)
@@ -77,7 +76,7 @@ def test_poses_inside_a_gate_wider_than_the_rejected_ones_do_not_end_the_inflati
     consistency = after_rejected(OtherGround(Agreement()), 4)
     before_m2 = consistency.variance_m2
     for _ in range(5):
-        consistency.on_pose(1.0, innovation(NEAR_M, sigma_m**2 * np.eye(2)), HEIGHT_M, BY_CONSENSUS)
+        consistency.on_pose(1.0, innovation(NEAR_M, sigma_m**2 * np.eye(2)), HEIGHT_M)
     assert (consistency.variance_m2 == 0.0) if ends else (consistency.variance_m2 > 0.9 * before_m2)
 
 
@@ -85,9 +84,9 @@ def test_after_many_rejected_poses_four_accepted_ones_over_new_ground_end_the_in
     """The evidence against a map is bounded: a long flight over changed ground must not outweigh the map after it."""
     consistency = after_rejected(OtherGround(Agreement()), 200)
     for _ in range(3):
-        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M, BY_CONSENSUS)
+        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
         assert consistency.variance_m2 > 0.0
-    consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M, BY_CONSENSUS)
+    consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
     assert consistency.variance_m2 == 0.0
 
 
@@ -95,7 +94,7 @@ def test_after_any_number_of_accepted_poses_three_rejected_ones_inflate_the_cova
     """The evidence for a map is bounded, too: a map that was right for a long way can still end."""
     consistency = OtherGround(Agreement())
     for _ in range(500):
-        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M, BY_CONSENSUS)
+        consistency.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
     assert probability(after_rejected(consistency, 3)) > 0.5
 
 
@@ -105,14 +104,14 @@ def test_ground_that_shows_nothing_widens_no_claim_and_makes_the_first_pose_of_a
     for i in range(8):
         ground.on_nothing(np.array([30.0 * i, 0.0]), HEIGHT_M, 0.2)
     assert ground.variance_m2 == 0.0
-    ground.on_pose(1.0, wide, HEIGHT_M, BY_CONSENSUS)
+    ground.on_pose(1.0, wide, HEIGHT_M)
     assert ground.variance_m2 == pytest.approx(probability(ground) * (400.0**2 + 2.0 * 290.0**2))
     assert probability(ground) > 0.9
     for _ in range(4):
-        ground.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M, BY_CONSENSUS)
+        ground.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
     assert ground.variance_m2 == 0.0  # four poses over new ground agree
     known = OtherGround(Agreement())  # no frame has shown nothing
-    known.on_pose(1.0, wide, HEIGHT_M, BY_CONSENSUS)
+    known.on_pose(1.0, wide, HEIGHT_M)
     assert known.variance_m2 == 0.0
 
 
@@ -133,25 +132,8 @@ def test_a_pose_that_was_fused_outside_of_the_gate_of_its_position_is_no_evidenc
     consistency = after_rejected(OtherGround(Agreement()), 4)
     before = probability(consistency)
     consistency.on_pose(
-        1.0, innovation(np.array([5.0 * 3.8, 0.0]), NARROW_M2), HEIGHT_M, BY_CONSENSUS
+        1.0, innovation(np.array([5.0 * 3.8, 0.0]), NARROW_M2), HEIGHT_M
     )  # the gate ends at 3.72 sigmas
     assert probability(consistency) == before
-    consistency.on_pose(1.0, innovation(np.array([5.0 * 3.6, 0.0]), NARROW_M2), HEIGHT_M, BY_CONSENSUS)
+    consistency.on_pose(1.0, innovation(np.array([5.0 * 3.6, 0.0]), NARROW_M2), HEIGHT_M)
     assert probability(consistency) < before
-
-
-@pytest.mark.parametrize(("inliers", "ends"), [(BY_CONSENSUS, False), (9, False), (20, True)])
-def test_one_pose_on_more_inliers_than_other_ground_gives_ends_the_doubt(inliers: int, ends: bool) -> None:
-    """Of 930 wrong places one gave twenty, the others nine to eleven."""
-    ground = after_rejected(OtherGround(Agreement()), 200)
-    ground.on_pose(1.0, innovation(NEAR_M, NARROW_M2), HEIGHT_M, inliers)
-    assert (ground.variance_m2 == 0.0) == ends
-
-
-def test_inliers_are_evidence_for_the_map_in_a_gate_that_accepts_wrong_poses_too() -> None:
-    wide = innovation(np.array([400.0, 0.0]), 290.0**2 * np.eye(2))
-    weak, strong = (after_rejected(OtherGround(Agreement()), 4) for _ in range(2))
-    before = probability(weak)
-    weak.on_pose(1.0, wide, HEIGHT_M, BY_CONSENSUS)
-    strong.on_pose(1.0, wide, HEIGHT_M, 20)
-    assert probability(strong) < 0.1 < before == pytest.approx(probability(weak), rel=0.05)
