@@ -301,6 +301,7 @@ class FrameMatcher:
         cells = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
         hypotheses = tuple(replace(hypothesis, stretch=stretch) for stretch in stretches)
         found = self.correlate_on(self.pyramid(image, self.gradients), view, belief, hypotheses, *cells)
+        found = self._with_learned(found, image, view, belief)
         return {one.stretch: score for one, score in zip(found.hypotheses, found.scores, strict=True)}
 
     def correlate(self, image: Image, view: View, belief: SearchWindow) -> CorrelationResult:
@@ -320,8 +321,13 @@ class FrameMatcher:
             coarse = self.correlate_on(pyramid, view, belief, hypotheses, gsd, 2 * pool)
             if coarse.verdict is Verdict.ACCEPTED:
                 hypotheses = coarse.best_hypotheses(MAX_FINE_HYPOTHESES)
-        found = self.correlate_on(pyramid, view, belief, hypotheses, gsd, pool)
-        # [measured: docs/decisions/074-weights-that-ship.md]
+        return self._with_learned(self.correlate_on(pyramid, view, belief, hypotheses, gsd, pool), image, view, belief)
+
+    def _with_learned(
+        self, found: CorrelationResult, image: Image, view: View, belief: SearchWindow
+    ) -> CorrelationResult:
+        """``found``, by gradients, with weights of one's own as second channel where the position is not known.
+        [measured: docs/decisions/074-weights-that-ship.md]"""
         if self._describer.name != OWN or view.sigma_m < RELIEF_SIGMA * view.agl_m:
             return found
         return found.with_second(self.correlate_learned(image, view, belief, found.hypotheses))

@@ -72,9 +72,7 @@ class ContradictedImages:
 
     def propagate(self, increment: MotionIncrement | None) -> None:
         """The motion to the next node, without odometry."""
-        if self.inertial_cov is None:
-            return
-        if increment is None or not increment.inertial:
+        if self.inertial_cov is None or increment is None or not increment.inertial:
             self.inertial_cov = None
             return
         if self._wrong is not None:  # meanwhile inertial readings drift

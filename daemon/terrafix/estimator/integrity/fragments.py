@@ -63,8 +63,7 @@ class Fragment:
         supports = evidence is not None and evidence.supports_same_flight(self.map_llr)
         self.consistent_frames = self.consistent_frames + 1 if supports else 0
         moves_as_predicted = self.consistent_frames >= CONFIRM_FRAMES
-        lasts = t_s - self.start_s >= CONFIRM_AFTER_S and self.frames >= CONFIRM_AFTER_FRAMES
-        timed_out = by_duration and lasts
+        timed_out = by_duration and t_s - self.start_s >= CONFIRM_AFTER_S and self.frames >= CONFIRM_AFTER_FRAMES
         self.confirmed = self.confirmed or moves_as_predicted or timed_out
         if moves_as_predicted and evidence is not None and evidence.inertial:
             self.join()

@@ -191,16 +191,12 @@ class OdometryMeasurement:
         turns_agree = heading.mahalanobis2 <= HEADING_GATE**2
         inertial = innovation.inertial and state.continuity.inertial_since_fused
         cov_m2 = innovation.cov_m2[HORIZONTAL, HORIZONTAL]
-        evidence = MotionEvidence(innovation.residual_m[HORIZONTAL], cov_m2, over_s, turns_agree, inertial)
-        contradicted = state.contradicted_images
-        if not contradicted.active:
-            fragment.add_frame(frame.t_s, evidence)
-            return
-        fragment.add_frame(
-            frame.t_s, self._of_contradicted(evidence, frame, seen, before, increment), by_duration=False
-        )
+        motion = MotionEvidence(innovation.residual_m[HORIZONTAL], cov_m2, over_s, turns_agree, inertial)
+        contradicted = state.contradicted_images.active
+        evidence = self._of_contradicted(motion, frame, seen, before, increment) if contradicted else motion
+        fragment.add_frame(frame.t_s, evidence, by_duration=not contradicted)
         if fragment.joined:
-            contradicted.end()
+            state.contradicted_images.end()
 
     def _of_contradicted(
         self,
@@ -217,7 +213,9 @@ class OdometryMeasurement:
             return None
         velocity_m2ps2 = contradicted.inertial_cov[VELOCITY, VELOCITY][HORIZONTAL, HORIZONTAL]
         cov_m2 = self._innovation_cov(frame.t_s, seen, increment, contradicted.inertial_cov)[HORIZONTAL, HORIZONTAL]
-        noise_m2 = cov_m2 - velocity_m2ps2 * evidence.dt_s**2
+        drifting = contradicted.inertial_cov.copy()  # with a velocity that is known: a difference may be indefinite
+        drifting[VELOCITY, :] = drifting[:, VELOCITY] = 0.0
+        noise_m2 = self._innovation_cov(frame.t_s, seen, increment, drifting)[HORIZONTAL, HORIZONTAL]
         yaw_rad = self._state.camera.yaw_rad(before.pose.rotation().matrix())
         turn = local_rotation_up(yaw_rad)[HORIZONTAL, HORIZONTAL]
         shown = WrongVelocity(
