@@ -316,6 +316,8 @@ class Prediction(Message, frozen=True, kw_only=True):
     fragment_id: int = -1  # fragment of the frame (as in Odometry); -1: none
     joined: bool = True  # something other than dead reckoning ties that fragment to the flight; True without a fragment
     readout_motion: ReadoutMotion | UnsetType = UNSET  # of a camera with a rolling shutter, where it is known
+    # Position that this camera would have by map matches that contradict the estimate; None: there are none
+    alternative_m: Vec2 | None = None
 
 
 # --- anchor ---------------------------------------------------------------------------------------
@@ -418,6 +420,8 @@ class MapMatch(Message, frozen=True, kw_only=True):
     search: SearchResult = SearchResult()
     # Scale of the image's x axis over that of its y axis, where the map shows that it is not 1
     aspect_ratio: float | None = None
+    # Log likelihood ratio [nats] of this frame: the alternative position of its Prediction over ``place``
+    alternative_nats: float | None = None
 
     @property
     def position_only(self) -> bool:

@@ -44,6 +44,7 @@ from terrafix.anchor.relocalization.relocalizer import (
     search_centre,
     unknown_sigma_m,
 )
+from terrafix.anchor.verification.alternative_place import alternative_nats
 from terrafix.anchor.verification.converged_place import PlaceTest
 from terrafix.anchor.verification.image_shape import AS_DESCRIBED, STRETCHES, ImageShape
 from terrafix.anchor.verification.lock_monitor import START_LOG_ODDS, LockMonitor, has_wide_sigma
@@ -291,6 +292,8 @@ class Localizer:
         hypothesis, score = seen.correlation.best_at(modes[0].e_m, modes[0].n_m)
         self._widen_if_poor(belief, score, seen.weight)
         match = with_belief(match, belief, modes, score)
+        nats = alternative_nats(prediction, modes[0], seen, hypothesis, score, belief.cell_m)
+        match = msgspec.structs.replace(match, alternative_nats=nats)
         self._test_shape(seen, belief, hypothesis, score)
         found = self._place_test is not None
         if self._place_test is not None:
@@ -337,7 +340,9 @@ class Localizer:
         self._untested_weight += seen.weight
         if seen.layer.drawn or self._untested_weight < 1.0 or not self._shape.is_in_doubt(score):
             return
-        scores = seen.layer.matcher.stretched_scores(seen.image, seen.view, belief, hypothesis, STRETCHES[1:])
+        hypotheses = tuple(replace(hypothesis, stretch=stretch) for stretch in STRETCHES[1:])
+        found = seen.layer.matcher.correlate_as(seen.image, seen.view, belief, hypotheses)
+        scores = {one.stretch: best for one, best in zip(found.hypotheses, found.scores, strict=True)}
         scores[AS_DESCRIBED] = seen.correlation.scores[seen.correlation.hypotheses.index(hypothesis)]
         if len(scores) == len(STRETCHES):
             self._shape.add(scores)

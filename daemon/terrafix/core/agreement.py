@@ -39,16 +39,13 @@ P_REJECTED, P_REJECTED_OTHER_GROUND = 0.1, 0.9
 P_NOTHING, P_NOTHING_DESCRIPTION = 0.2, 0.99
 # ... and over ground that the map does not show, where one in five gives a pose. [measured: docs/monte-carlo.md]
 P_NOTHING_OTHER_GROUND = 0.8
-# Heights of new ground over which a repeating pattern becomes less probable by 1/e: its length. [tuned]
-PATTERN_HEIGHTS = 5.0
 
-# Rows: for a unit of new ground, which for ELSEWHERE is one height above ground, for OTHER_GROUND the share of the pose
-# that is independent of those before (correlated_fixes.py), for START and DESCRIPTION one correlation over other ground
-# than before. Correlations without a pose count for OTHER_GROUND by the hit rate of the flight (other_ground.py): over
-# bare ground they are frequent.
+# Rows: for a unit of new ground, which for OTHER_GROUND is the share of the pose that is independent of those before
+# (correlated_fixes.py), for START and DESCRIPTION one correlation over other ground than before. Correlations without a
+# pose count for OTHER_GROUND by the hit rate of the flight (other_ground.py): over bare ground they are frequent. For
+# ELSEWHERE the anchor correlates each frame at that place as well (anchor/verification/alternative_place.py).
 NATS: dict[Observed, dict[Cause, float]] = {
     Observed.POSE: {
-        Cause.ELSEWHERE: -1.0 / PATTERN_HEIGHTS,
         Cause.OTHER_GROUND: math.log((1.0 - P_REJECTED_OTHER_GROUND) / (1.0 - P_REJECTED)),
         Cause.START: -math.inf,  # from then on the map has the position
         Cause.DESCRIPTION: math.log((1.0 - P_NOTHING_DESCRIPTION) / (1.0 - P_NOTHING)),

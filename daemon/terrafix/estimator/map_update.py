@@ -1,6 +1,5 @@
 """Map matches: gated, fused, and compared with other positions that the vehicle may have."""
 
-import math
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -82,14 +81,12 @@ class MapUpdate:
         self._fixes = CorrelatedFixes()
         self._map_hit_rate = MapHitRate()
         self._newest_match_ns = -1
-        self._stretched = False  # matches of images with another shape have counted since the last one that is used
         self._rejected = InnovationRun()
         self._coarse = InnovationRun()  # coarse matches of a graph that does not know its position
 
     def apply(self, match: MapMatch) -> MapResult:
         """``match``: of a frame that ``Propagation.advance`` has had. It enters the graph at the node of that frame."""
         state = self._state
-        self._stretched = self._stretched or match.aspect_ratio is not None
         node = state.node_of.get(match.frame_id)
         if node is not None and not state.graph.holds(node):
             node = None
@@ -192,25 +189,22 @@ class MapUpdate:
         contradicted = state.contradicted_images.active
         if not match.position_only:
             self.hypotheses.other_ground.on_pose(share, position, height_m)
-            self._learn_from_pose(match, node, before, measurement)
+            self._learn_roughness(before, measurement)
             alone = replace(measurement, information_share=1.0)
             self._weigh_fragment(node, levelled(alone, *predicted))
         self._accept(match, fixed_s, here)
+        self.hypotheses.other.on_match(match.frame_id, match.alternative_nats)
         state.covariances.record(node)
         agree = contradicted and not state.contradicted_images.active
         return MapResult(replace(fusion, detail=f"information share {share:.2f}"), (), fixed, off, agree)
 
-    def _learn_from_pose(self, match: MapMatch, node: int, before: NodeState, measurement: MapPoseMeasurement) -> None:
-        """Updates terrain roughness, alternative position and map hit rate with an accepted pose. ``before``: the node
-        without it."""
+    def _learn_roughness(self, before: NodeState, measurement: MapPoseMeasurement) -> None:
+        """Updates terrain roughness with an accepted pose. ``before``: the node without it."""
         state, height_m, here = self._state, self._height_m(measurement), measurement.position_m
         if state.has_height and not state.terrain.has_dem:
             cov = tangent_to_world(measurement.cov, measurement.pose.rotation().matrix())
             level_m = float(before.barometric_up_m - measurement.pose.translation()[UP])
             state.terrain.roughness.update(here, height_m, level_m, float(np.sqrt(cov[UP, UP])))
-        if self._fixes.newest_s is not None:
-            new_m = self._fixes.new_ground_m(state.graph.time_of(node), here, math.inf)
-            self.hypotheses.other.on_pose(new_m / height_m, _place_mass(match))
 
     def _weigh_fragment(self, node: int, placed: FixedPose) -> None:
         """A pose joins the fragment of its frame, unless its images have contradicted inertial readings: then the next
@@ -236,9 +230,6 @@ class MapUpdate:
         state.last_fix_s = self._fixes.newest_s
         state.on_placed()
         self.hypotheses.on_match_accepted()
-        if self._stretched and match.aspect_ratio is None:  # what those said of other places does not count
-            self._stretched = False
-            self.hypotheses.on_relocalized()
         self.map_sigma_m = match.map_sigma_m
         last = state.refresh_newest()
         state.speed_prior.update_by_map(last.t_s, last.velocity_mps, last.velocity_cov)
@@ -267,12 +258,14 @@ class MapUpdate:
         certain = other.weight == 0.0
         found = run.is_confirmed(COARSE_FINDS_AFTER, COARSE_FINDS_OVER * height)
         if found or (run.poses if certain else len(run.offsets_m)) >= MIN_CONSISTENT:
-            other.spawn(run.offsets_m, apart, fixed=state.last_fix_s is not None)
+            assert state.last is not None
+            first_frame = state.last.frame_id + 1
+            other.spawn(run.offsets_m, apart, first_frame)
             # Before the first fix only the start coordinate supports the graph: as much as one such pose against it.
             first = state.last_fix_s is None and match.inliers >= OUTWEIGHS_START
             needed = (MIN_CONSISTENT, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
             if (found or run.is_confirmed(*needed, poses_only=certain)) and _place_mass(match) >= RECOVER_MASS:
-                other.switch(offset, apart)
+                other.switch(offset, apart, first_frame)
                 return self._reset(match, self._past(node), measurement, "restarted")
         detail = f"horizontally {float(np.hypot(*offset)):.0f} m from the estimate"
         off = None if coarse else position

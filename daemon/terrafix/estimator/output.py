@@ -15,7 +15,7 @@ from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
 from terrafix.estimator.integrity.fragments import Fragment
 from terrafix.estimator.integrity.innovation import FusionVerdict, Innovation
-from terrafix.estimator.state import UP
+from terrafix.estimator.state import HORIZONTAL, UP
 from terrafix.messages import (
     CalibrationEstimate,
     MeasurementVerdict,
@@ -80,6 +80,8 @@ def prediction_of(
     """``step_m`` (2,): of the camera since the frame of the Prediction before, with its variance on each axis."""
     r_w_c, p = frame.pose.rotation().matrix(), frame.pose.translation()
     cov = tangent_to_world(frame.cov, r_w_c)
+    other = estimator.hypotheses.other
+    alternative_m = None if other.weight == 0.0 else (p[HORIZONTAL] + other.offset_m).tolist()
     return Prediction(
         t_ns=t_ns,
         frame_id=frame.frame_id,
@@ -93,6 +95,7 @@ def prediction_of(
         radial_k1=estimator.state.radial_k1(frame.node),
         prior_t_ns=max(prior_t_ns, round(estimator.dead_reckoned_s * 1e9)),
         readout_motion=readout_motion,
+        alternative_m=alternative_m,
         **_named(estimator.state.fragment_of(frame.frame_id)),
     )
 

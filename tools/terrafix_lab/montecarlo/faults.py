@@ -78,8 +78,10 @@ def no_match(match: MapMatch) -> MapMatch:
 
 
 def wrong_match(match: MapMatch, shot: Shot, offset_m: np.ndarray, rng: np.random.Generator) -> MapMatch:
-    """An accepted match with a small covariance, ``offset_m`` (2,) from the true position."""
+    """An accepted match with a small covariance, ``offset_m`` (2,) from the true position. The frame fits there as it
+    fits elsewhere."""
     p = shot.p_m + np.array([*(offset_m + WRONG_SIGMA_M * rng.normal(size=2)), WRONG_SIGMA_M * rng.normal()])
     sigmas = np.array([WRONG_SIGMA_M] * 3 + [WRONG_SIGMA_RAD] * 3)
-    found = solved(msgspec.structs.replace(match, verdict=Verdict.ACCEPTED, belief=None))
+    nats = None if match.alternative_nats is None else 0.0
+    found = solved(msgspec.structs.replace(match, verdict=Verdict.ACCEPTED, belief=None, alternative_nats=nats))
     return placed(found, p, quat_from_rot(shot.r_w_c), sigmas, inliers=30)

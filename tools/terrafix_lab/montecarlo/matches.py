@@ -16,10 +16,12 @@ from terrafix.anchor.frame_pose import (
     confirm_pose,
     with_belief,
 )
+from terrafix.anchor.localizer import MIN_OBSERVATION_WEIGHT, NEW_GROUND_SHARE
 from terrafix.anchor.matching.frame_matcher import FIX_GSD_PER_AGL, PATCH_PER_AGL, PatchFix, View
 from terrafix.anchor.matching.match_message import mode_match, pose_match
 from terrafix.anchor.matching.patch_matcher import MAX_PATCHES
 from terrafix.anchor.matching.point_mass_filter import Mode, belief_cell_m
+from terrafix.anchor.verification.alternative_place import weighed
 from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, SEARCH_RADIUS, solve
@@ -39,6 +41,7 @@ DEM_ERROR_M = 1.0  # 1-sigma of a constant per flight; the elevation has no loca
 WINDOW_M, WINDOW_SIGMAS = 120.0, 4.0  # half of the search window: at least, and in sigmas of the prediction
 HYPOTHESES = 1.5  # sigmas of heading and scale that are searched ...
 YAW_TOLERANCE_RAD, SCALE_TOLERANCE = math.radians(6.0), 0.08  # ... and the tolerance of the descriptors beyond
+ELSEWHERE_SCORE = 1.5  # mean of the best cell of a mode elsewhere, with a spread of one
 MASS, SCORE, SCORE_SPREAD = 0.995, 6.5, 2.0  # of the belief's mode; real flights: mass 0.97 to 1, score 2.8 to 10
 GRID = np.array([-0.4, 0.0, 0.4])  # of a patch: points at which the height of objects is sampled
 
@@ -60,6 +63,7 @@ class MapMatches:
         self._belief_rng = np.random.default_rng([seed, 62])
         self._belief: TrackedBelief | None = None  # while the frames are not found near their predictions
         self._has_found = False
+        self._seen_m = np.full(2, np.inf)  # place that the last frame showed
 
     def match(self, prediction: Prediction, shot: Shot, *, usable: bool = True) -> MapMatch:
         """``usable`` False: the belief is not updated, since a search is active."""
@@ -74,6 +78,7 @@ class MapMatches:
             return self._match_in_belief(result, prediction, shot, place if in_range else None) if usable else result
         self._belief, self._has_found = None, True
         score = SCORE + SCORE_SPREAD * (float(self._rng.normal()) + 0.5 * (good - 0.5))
+        result = msgspec.structs.replace(result, alternative_nats=self._alternative_nats(prediction, place, score))
         mode = Mode(float(place[0]), float(place[1]), MASS, 0.0, belief_cell_m(agl_m, 0.0) ** 2)
         view = _view_at(mode, prediction, agl_m)
         result = msgspec.structs.replace(result, place=MatchPlace(e_m=mode.e_m, n_m=mode.n_m, mass=MASS))
@@ -81,6 +86,15 @@ class MapMatches:
         if result.verdict is Verdict.ACCEPTED or score < COARSE_SCORE:
             return result
         return mode_match(result, mode, belief_cell_m(agl_m, 0.0), view, None)
+
+    def _alternative_nats(self, prediction: Prediction, place_m: np.ndarray, score: float) -> float | None:
+        """Of a frame that shows ``place_m`` (2,), with a correlation of ``score``."""
+        new_m, self._seen_m = float(np.hypot(*(place_m - self._seen_m))), place_m
+        if prediction.alternative_m is None:
+            return None
+        new_ground = new_m / (NEW_GROUND_SHARE * footprint_m(self._lens.described, prediction.agl_m))
+        there = ELSEWHERE_SCORE + float(self._belief_rng.normal())
+        return weighed(there, score, min(max(new_ground, MIN_OBSERVATION_WEIGHT), 1.0))
 
     def no_match(self, prediction: Prediction, shot: Shot, *, verdict: Verdict, usable: bool = True) -> MapMatch:
         """The match of a frame that is not compared with the map; the arguments of ``match``, and its verdict."""

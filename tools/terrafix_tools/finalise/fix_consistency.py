@@ -59,6 +59,6 @@ def ambiguous_segments(
             middle = np.median(offsets, axis=0) if offsets else np.zeros(2)
             other = AlternativePosition()
             # The error of their common offset is far less than the distance between them.
-            other.spawn([o for o in offsets if np.hypot(*(o - middle)) <= CONSISTENT_M], np.zeros((2, 2)), fixed=True)
+            other.spawn([o for o in offsets if np.hypot(*(o - middle)) <= CONSISTENT_M], np.zeros((2, 2)))
             if other.weight > 0.0:
                 yield at, other.moments_m2()

@@ -288,22 +288,6 @@ class FrameMatcher:
     def _stretched(self, stretch: tuple[float, float]) -> CameraCalibration:
         return replace(self.camera, fx=stretch[0] * self.camera.fx, fy=stretch[1] * self.camera.fy)
 
-    def stretched_scores(
-        self,
-        image: Image,
-        view: View,
-        belief: SearchWindow,
-        hypothesis: Hypothesis,
-        stretches: Sequence[tuple[float, float]],
-    ) -> dict[tuple[float, float], float]:
-        """-> highest standardised correlation in the search window of the image with each of ``stretches`` that sees
-        ground; empty: the window has no map data."""
-        cells = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
-        hypotheses = tuple(replace(hypothesis, stretch=stretch) for stretch in stretches)
-        found = self.correlate_on(self.pyramid(image, self.gradients), view, belief, hypotheses, *cells)
-        found = self._with_learned(found, image, view, belief)
-        return {one.stretch: score for one, score in zip(found.hypotheses, found.scores, strict=True)}
-
     def correlate(self, image: Image, view: View, belief: SearchWindow) -> CorrelationResult:
         """Correlation surfaces over the search window, one per yaw and scale hypothesis within the uncertainty of
         ``view``.
@@ -311,16 +295,22 @@ class FrameMatcher:
         Verdict TOO_LOW: the frame covers too few cells or sees no ground; OUTSIDE_MAP: no map data in the window.
         """
         hypotheses = self._next_subset(hypotheses_of(view))
-        pyramid = self.pyramid(image, self.gradients)
-        gsd, pool = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
-        # Of a drawn map, which says little, every hypothesis counts: the belief itself searches it. Its lines are as
-        # clear on larger pixels.
-        if self._drawn:
-            return self.correlate_on(pyramid, view, belief, hypotheses, gsd * pool)
-        if len(hypotheses) > MAX_FINE_HYPOTHESES:
-            coarse = self.correlate_on(pyramid, view, belief, hypotheses, gsd, 2 * pool)
+        # Of a drawn map, which says little, every hypothesis counts: the belief itself searches it.
+        if len(hypotheses) > MAX_FINE_HYPOTHESES and not self._drawn:
+            gsd, pool = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
+            coarse = self.correlate_on(self.pyramid(image, self.gradients), view, belief, hypotheses, gsd, 2 * pool)
             if coarse.verdict is Verdict.ACCEPTED:
                 hypotheses = coarse.best_hypotheses(MAX_FINE_HYPOTHESES)
+        return self.correlate_as(image, view, belief, hypotheses)
+
+    def correlate_as(
+        self, image: Image, view: View, belief: SearchWindow, hypotheses: tuple[Hypothesis, ...]
+    ) -> CorrelationResult:
+        """``correlate`` with given hypotheses."""
+        gsd, pool = bounded_cells(self.correlation_cell_m(view.agl_m), 1, belief)
+        pyramid = self.pyramid(image, self.gradients)
+        if self._drawn:  # its lines are as clear on larger pixels
+            return self.correlate_on(pyramid, view, belief, hypotheses, gsd * pool)
         return self._with_learned(self.correlate_on(pyramid, view, belief, hypotheses, gsd, pool), image, view, belief)
 
     def _with_learned(
