@@ -10,7 +10,7 @@ from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameState
 from terrafix.estimator.measurements.map_pose import MapPoseMeasurement
 from terrafix.estimator.state import VELOCITY
-from terrafix.messages import MapMatch, MatchPlace, Verdict
+from terrafix.messages import MapMatch, MatchPlace, Prediction, Verdict
 
 FRAMES = 14
 FAR_M = (300.0, -200.0)
@@ -99,3 +99,23 @@ def test_only_matches_in_a_mode_with_almost_all_mass_restart_the_graph(mass: flo
             break
         assert run.verdicts("map")[i].verdict is Verdict.INNOVATION
     assert any("restarted" in detail for detail in details) is restarts
+
+
+def test_images_that_fit_worse_at_an_alternative_position_end_it() -> None:
+    """Two matches 120 m off agree with each other; frames that are predicted after them are compared with both."""
+    flight, away_m = Flight(20, seed=6, dem=True), np.array([120.0, 0.0])
+    run = EstimatorRun().fly(flight, 0, 10)
+    for i in (10, 11):
+        run.fly(flight, i, i + 1, without_fix)
+        run.feed([flight.fix(i, offset_m=(120.0, 0.0))])
+    run.fly(flight, 12, 13, without_fix)
+    predictions = {message.frame_id: message for message in run.published if isinstance(message, Prediction)}
+    assert predictions[11].alternative_m is None and predictions[12].alternative_m is not None
+    off_m = np.subtract(predictions[12].alternative_m, predictions[12].p_c_in_w_m[:2])
+    assert float(np.hypot(*(off_m - away_m))) < 15.0
+    weights = []
+    for frame in (11, 12):
+        run.feed([msgspec.structs.replace(flight.fix(frame), alternative_nats=-4.0)])
+        assert run.verdicts("map")[frame].verdict is Verdict.ACCEPTED
+        weights.append(newest(run)[0].hypotheses.other.weight)
+    assert weights == [pytest.approx(0.5, abs=0.01), 0.0]

@@ -147,8 +147,8 @@ def test_shipped_weights_are_a_second_channel_where_the_position_is_not_known(
     assert peak_m == pytest.approx(tuple(TRUE_M[:2]), abs=4.0)
     difference = np.nan_to_num(both.surfaces[0].z - alone.z)
     assert 0.3 < difference.std() < 1.5
-    stretched = learned.stretched_scores(frame, predicted_view(), belief, AS_PREDICTED, [AS_PREDICTED.stretch])
-    assert stretched[AS_PREDICTED.stretch] == both.scores[0]  # other shapes of the image are compared with these
+    given = learned.correlate_as(frame, predicted_view(), belief, (AS_PREDICTED,))
+    assert given.scores == both.scores  # other shapes of the image are compared with these
     known = replace(predicted_view(), sigma_m=10.0)
     np.testing.assert_array_equal(learned.correlate(frame, known, belief).surfaces[0].z, alone.z)
 
