@@ -292,7 +292,7 @@ class Localizer:
         hypothesis, score = seen.correlation.best_at(modes[0].e_m, modes[0].n_m)
         self._widen_if_poor(belief, score, seen.weight)
         match = with_belief(match, belief, modes, score)
-        nats = alternative_nats(prediction, modes[0], seen, hypothesis, score, belief.cell_m)
+        nats = alternative_nats(prediction, modes[0], seen)
         match = msgspec.structs.replace(match, alternative_nats=nats)
         self._test_shape(seen, belief, hypothesis, score)
         found = self._place_test is not None

@@ -188,6 +188,8 @@ class MapUpdate:
         off = None if match.position_only else measurement.position_innovation(*predicted)
         contradicted = state.contradicted_images.active
         if not match.position_only:
+            if match.belief is not None and not match.on_drawn:
+                self.hypotheses.other_ground.on_score(share, match.belief.mode_score)
             self.hypotheses.other_ground.on_pose(share, position, height_m)
             self._learn_roughness(before, measurement)
             alone = replace(measurement, information_share=1.0)

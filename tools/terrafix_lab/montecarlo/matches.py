@@ -14,6 +14,7 @@ from terrafix.anchor.frame_pose import (
     MIN_POSE_MODE_MASS,
     POSE_LIKELIHOOD_RATIO,
     confirm_pose,
+    reported_modes,
     with_belief,
 )
 from terrafix.anchor.localizer import MIN_OBSERVATION_WEIGHT, NEW_GROUND_SHARE
@@ -26,7 +27,7 @@ from terrafix.core.geodesy import quat_from_rot, rot_from_quat
 from terrafix.core.limits import MIN_MATCHING_AGL_M
 from terrafix.core.pnp import INLIER_THRESHOLD, PNP_MIN_INLIERS, SEARCH_RADIUS, solve
 from terrafix.core.pose import log_so3
-from terrafix.messages import GroundPlane, MapMatch, MatchPlace, PnpInput, Prediction, Verdict
+from terrafix.messages import BeliefSummary, GroundPlane, MapMatch, MatchPlace, PnpInput, Prediction, Verdict
 from terrafix_lab.montecarlo.flown import Shot
 from terrafix_lab.montecarlo.ground import MAP_SEES_TOPS, MapError, Terrain
 from terrafix_lab.montecarlo.lens import TrueLens, footprint_m
@@ -81,7 +82,16 @@ class MapMatches:
         result = msgspec.structs.replace(result, alternative_nats=self._alternative_nats(prediction, place, score))
         mode = Mode(float(place[0]), float(place[1]), MASS, 0.0, belief_cell_m(agl_m, 0.0) ** 2)
         view = _view_at(mode, prediction, agl_m)
-        result = msgspec.structs.replace(result, place=MatchPlace(e_m=mode.e_m, n_m=mode.n_m, mass=MASS))
+        result = msgspec.structs.replace(
+            result,
+            place=MatchPlace(e_m=mode.e_m, n_m=mode.n_m, mass=MASS),
+            belief=BeliefSummary(
+                mean_m=(mode.e_m, mode.n_m),
+                cov_m2=(mode.var_m2, 0.0, 0.0, mode.var_m2),
+                modes=reported_modes([mode]),
+                mode_score=score,
+            ),
+        )
         result = pose_match(result, self._fix(shot, good, view), view)
         if result.verdict is Verdict.ACCEPTED or score < COARSE_SCORE:
             return result

@@ -15,7 +15,8 @@ from terrafix.anchor.matching.descriptor_store import DescriptorStore
 from terrafix.anchor.matching.ncc import CorrelationWindow, standardise
 from terrafix.anchor.matching.orthorectify import Pyramid, Rectified, Relief, patch_centres, rays_to, rectify
 from terrafix.anchor.matching.patch_matcher import SearchedMap, match_patches
-from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_SLOPE, BELIEF_LLR_ZERO_Z, Surface
+from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_ZERO_Z, Surface
+from terrafix.core.agreement import NATS_PER_SCORE
 from terrafix.core.camera import CameraCalibration
 from terrafix.core.geodesy import local_rotation_up, quat_from_rot
 from terrafix.core.node import Image
@@ -174,7 +175,7 @@ class CorrelationResult:
         scores = np.array([z[s] for s in scales])
         if int(np.argmax(scores)) in (0, len(scales) - 1):
             return None
-        likelihood = np.exp(BELIEF_LLR_SLOPE * (scores - scores.max()))
+        likelihood = np.exp(NATS_PER_SCORE * (scores - scores.max()))
         likelihood /= likelihood.sum()
         mean = float(likelihood @ scales)
         # Remove the information of the grid itself ("one of these scales"): the prediction chose it.

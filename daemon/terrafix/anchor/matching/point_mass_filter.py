@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-# Log likelihood ratio "here against elsewhere" as a function of the standardised correlation z: slope, and z at which
-# it is zero. Fitted to the scores of right and wrong places on seven pairs of real images of the same ground at two
-# dates. Right places have z = 3 to 8 (median 3.6 to 6.9 by pair); the best of tens of thousands of wrong places has 3.0
-# in the median (98 % below 4.1). [measured: this comment]
-BELIEF_LLR_SLOPE = 3.0
-BELIEF_LLR_ZERO_Z = 1.9  # [measured: comment of BELIEF_LLR_SLOPE]
+from terrafix.core.agreement import NATS_PER_SCORE
+
+# Standardised correlation z at which the log likelihood ratio "here against elsewhere" is zero; its slope is
+# NATS_PER_SCORE. [measured: core/agreement.py]
+BELIEF_LLR_ZERO_Z = 1.9
 BELIEF_LLR_MIN, BELIEF_LLR_MAX = -3.0, 9.0  # bounds of the log likelihood ratio of one frame [tuned]
 # share of the mass that a full observation redistributes uniformly over the window, so that no position is excluded
 # [tuned]
@@ -259,7 +258,7 @@ def log_likelihood_ratio(z: np.ndarray) -> np.ndarray:
     counts slightly worse than random alignment."""
     known = np.nan_to_num(z, nan=-9.0)
     return np.where(
-        known < -5.0, -1.0, np.clip(BELIEF_LLR_SLOPE * (known - BELIEF_LLR_ZERO_Z), BELIEF_LLR_MIN, BELIEF_LLR_MAX)
+        known < -5.0, -1.0, np.clip(NATS_PER_SCORE * (known - BELIEF_LLR_ZERO_Z), BELIEF_LLR_MIN, BELIEF_LLR_MAX)
     )
 
 

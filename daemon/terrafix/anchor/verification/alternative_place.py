@@ -6,8 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.anchor.frame_pose import Observation
-from terrafix.anchor.matching.frame_matcher import Hypothesis
-from terrafix.anchor.matching.point_mass_filter import MIN_HALF_CELLS, MODE_RADIUS_CELLS, Mode, log_likelihood_ratio
+from terrafix.anchor.matching.point_mass_filter import (
+    MIN_HALF_CELLS,
+    MODE_RADIUS_CELLS,
+    Mode,
+    belief_cell_m,
+    log_likelihood_ratio,
+)
 from terrafix.messages import Prediction, Verdict
 
 # Largest log likelihood ratio of a full observation [nats]: one frame alone does not exclude a place
@@ -22,11 +27,9 @@ class Square:
     half_m: float
 
 
-def alternative_nats(
-    prediction: Prediction, mode: Mode, seen: Observation, hypothesis: Hypothesis, score: float, cell_m: float
-) -> float | None:
-    """MapMatch.alternative_nats of the frame ``seen``, whose standardised correlation at ``mode`` is ``score`` with
-    ``hypothesis``, on cells of ``cell_m``; None: there is no alternative, or the map does not reach it.
+def alternative_nats(prediction: Prediction, mode: Mode, seen: Observation) -> float | None:
+    """MapMatch.alternative_nats of the frame ``seen``, whose place is ``mode``; None: there is no alternative, or the
+    map does not reach it.
 
     The image is shifted against the prediction by the error of position and tilt, at both places by as much. Within a
     mode of the belief the best cell counts, since two places are not known to a cell."""
@@ -34,6 +37,8 @@ def alternative_nats(
         return None
     off_e_m, off_n_m = mode.e_m - prediction.p_c_in_w_m[0], mode.n_m - prediction.p_c_in_w_m[1]
     there_m = prediction.alternative_m[0] + off_e_m, prediction.alternative_m[1] + off_n_m
+    hypothesis, score = seen.correlation.best_at(mode.e_m, mode.n_m)
+    cell_m = belief_cell_m(seen.view.agl_m, seen.correlation.cell_m)
     view, window = replace(seen.view, e_m=there_m[0], n_m=there_m[1]), Square(there_m, MIN_HALF_CELLS * cell_m)
     found = seen.layer.matcher.correlate_as(seen.image, view, window, (hypothesis,))
     if found.verdict is not Verdict.ACCEPTED:

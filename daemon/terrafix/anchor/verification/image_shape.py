@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_MAX, BELIEF_LLR_SLOPE
-from terrafix.core.agreement import STATED, Agreement, Cause, Range
+from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_MAX
+from terrafix.core.agreement import NATS_PER_SCORE, STATED, WRONG_SCORE, Agreement, Cause, Range
 
 # Scale of a stretched axis. [spec: 4:3, 3:2 and 16:9 differ by 1.19 and 1.33; a correlation tolerates a tenth]
 STRETCH = 1.25
@@ -27,8 +27,6 @@ STRETCHES = (*SAME_SHAPE, *(one for shapes in OTHER_SHAPES.values() for one in s
 # Standard deviations by which another shape has to fit better: the lead of the best of some wrong ones, where no shape
 # fits. [measured: docs/decisions/059-images-against-inertial-sensors.md]
 LEAD = 0.5
-# Largest score of 98 % of the wrong places: a frame that scores less may have another shape than those before it.
-DOUBTFUL_SCORE = 4.1  # [measured: anchor/matching/point_mass_filter.py]
 CERTAIN = math.log(1000.0)  # nats, for and against [spec: one in a thousand]
 # Share of the height: error of a position by an image with one axis stretched. [spec: of what is seen a height away]
 STRETCHED_SHARE = STRETCH - 1.0
@@ -45,15 +43,16 @@ class ImageShape:
         self.ratio: float | None = None
 
     def is_in_doubt(self, score: float) -> bool:
-        """Whether a frame with this standardised correlation, as described, is to be tested."""
-        return score < DOUBTFUL_SCORE or any(odds > -CERTAIN for odds in self._log_odds.values())
+        """Whether a frame with this standardised correlation, as described, is to be tested: one of a wrong place may
+        have another shape than those before it."""
+        return score < WRONG_SCORE or any(odds > -CERTAIN for odds in self._log_odds.values())
 
     def add(self, scores: Mapping[Stretch, float]) -> None:
         """``scores``: highest standardised correlation of a frame with each of STRETCHES."""
         self._tested = True
         as_described = max(scores[one] for one in SAME_SHAPE)
         for ratio, shapes in OTHER_SHAPES.items():
-            nats = BELIEF_LLR_SLOPE * (max(scores[one] for one in shapes) - as_described - LEAD)
+            nats = NATS_PER_SCORE * (max(scores[one] for one in shapes) - as_described - LEAD)
             bounded = float(np.clip(nats, -BELIEF_LLR_MAX, BELIEF_LLR_MAX))
             self._agreements[ratio].add(Cause.DESCRIPTION, bounded)
         ratio, log_odds = max(self._log_odds.items(), key=lambda item: item[1])

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrafix.anchor.matching.frame_matcher import CorrelationResult, FrameMatcher, PatchFix, View, view_at
-from terrafix.anchor.matching.point_mass_filter import BELIEF_LLR_SLOPE, Mode
+from terrafix.anchor.matching.point_mass_filter import Mode
 from terrafix.anchor.verification.hypothesis_tracker import (
     DECISION_MARGIN,
     NEIGHBOUR_RADIUS,
@@ -22,13 +22,14 @@ from terrafix.anchor.verification.hypothesis_tracker import (
 )
 from terrafix.anchor.verification.patch_null import PatchNull
 from terrafix.anchor.verification.place_verifier import FINE_PLACE_CELL_PER_AGL, PlaceVerifier, VerifiedPlace
+from terrafix.core.agreement import NATS_PER_SCORE
 from terrafix.core.node import Image
 from terrafix.map.null_model import DEFAULT_NULL, Tail
 
 # Modes that are compared, about 50 ms each. Of twelve, the last four hold the right place in 1 % of the frames.
 # [measured: docs/decisions/072-single-frames-in-one-score.md]
 MAX_MODES = 8
-# Nats per standard deviation of the patches: decay of the tail of wrong places, as ``BELIEF_LLR_SLOPE`` of the
+# Nats per standard deviation of the patches: decay of the tail of wrong places, as ``NATS_PER_SCORE`` of the
 # correlation. [spec: DEFAULT_NULL.frame]
 PATCH_LLR_SLOPE = DEFAULT_NULL.frame.count / DEFAULT_NULL.frame.excess
 # Nats of the best place over the mean of the others where all are wrong.
@@ -67,7 +68,7 @@ def localize_single_frame(
         there = view_at(view, hypothesis, mode.e_m, mode.n_m)
         if (place := verifier.verify(image, there, FINE_PLACE_CELL_PER_AGL)) is not None:
             sigmas = PatchNull().sigmas(place.consensus, fine=True)
-            score = BELIEF_LLR_SLOPE * z + PATCH_LLR_SLOPE * sigmas
+            score = NATS_PER_SCORE * z + PATCH_LLR_SLOPE * sigmas
             scored.append(ScoredMode(mode, there, place, sigmas, score))
     best = max(scored, key=lambda one: one.score, default=None)
     if best is None:

@@ -6,10 +6,12 @@ import math
 import numpy as np
 
 from terrafix.core.agreement import (
+    NATS_PER_SCORE,
     P_NOTHING_OTHER_GROUND,
     P_REJECTED,
     P_REJECTED_OTHER_GROUND,
     RANGES,
+    WRONG_SCORE,
     Agreement,
     Cause,
     Observed,
@@ -52,6 +54,12 @@ class OtherGround:
             self._nothing_at_m = at_m
             # A hit rate below that over other ground is one of other ground.
             self.agreement.add(Cause.OTHER_GROUND, max(math.log(P_NOTHING_OTHER_GROUND / p_nothing), 0.0))
+
+    def on_score(self, information_share: float, score: float) -> None:
+        """The best place of a frame, whose pose was fused, has this standardised correlation: more than over ground
+        that the map does not show."""
+        nats = min(NATS_PER_SCORE * (WRONG_SCORE - score), 0.0)
+        self.agreement.add(Cause.OTHER_GROUND, information_share * nats)
 
     def on_pose(self, information_share: float, position: Innovation, height_m: float) -> None:
         """A camera pose that was fused, weighted by the share 0..1 of the ground in it that is new. ``position``: the

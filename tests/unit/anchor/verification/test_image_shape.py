@@ -6,13 +6,13 @@ import pytest
 from anchor_rig import started
 from single_map_place import AGL_M, TRUE_M, R, predicted
 from terrafix.anchor.verification.image_shape import (
-    DOUBTFUL_SCORE,
     OTHER_SHAPES,
     SAME_SHAPE,
     STRETCHES,
     ImageShape,
     Stretch,
 )
+from terrafix.core.agreement import WRONG_SCORE
 from terrafix.messages import MapMatch
 from terrafix_lab.faults.pictures import scaled
 from textured_ground import PINHOLE, view
@@ -30,7 +30,7 @@ def test_images_that_fit_the_map_as_described_are_not_tested_again_until_one_fit
     for _ in range(2):
         shape.add(scores(described=8.0))
     assert shape.ratio is None and shape.sigma_m(100.0) == 0.0
-    assert not shape.is_in_doubt(DOUBTFUL_SCORE + 0.1) and shape.is_in_doubt(DOUBTFUL_SCORE - 0.1)
+    assert not shape.is_in_doubt(WRONG_SCORE + 0.1) and shape.is_in_doubt(WRONG_SCORE - 0.1)
 
 
 @pytest.mark.parametrize(("axis", "ratio"), [("x", 1.25), ("y", 0.8)])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrafix.core.agreement import Agreement, Cause
+from terrafix.core.agreement import WRONG_SCORE, Agreement, Cause
 from terrafix.core.gate import GATE, MIN_COMPONENT_WEIGHT
 from terrafix.estimator.integrity.innovation import Innovation
 from terrafix.estimator.integrity.other_ground import OtherGround
@@ -60,6 +60,18 @@ def test_accepted_poses_end_the_inflation_only_over_new_ground() -> None:
         flying.on_pose(0.5, innovation(NEAR_M, NARROW_M2), HEIGHT_M)
     assert probability(hovering) == probability(after_rejected(OtherGround(Agreement()), 4))
     assert flying.variance_m2 == 0.0
+
+
+def test_a_frame_that_fits_better_than_any_wrong_place_ends_the_inflation_over_new_ground_alone() -> None:
+    for score, share, ends in (
+        (WRONG_SCORE, 1.0, False),
+        (WRONG_SCORE + 3.0, 0.1, False),
+        (WRONG_SCORE + 3.0, 1.0, True),
+    ):
+        ground = after_rejected(OtherGround(Agreement()), 6)
+        before_m2 = ground.variance_m2
+        ground.on_score(share, score)
+        assert (ground.variance_m2 == 0.0) if ends else (ground.variance_m2 > 0.9 * before_m2)
 
 
 def test_the_distance_of_earlier_rejected_poses_is_forgotten_after_accepted_ones() -> None:
