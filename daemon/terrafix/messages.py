@@ -418,7 +418,7 @@ class MapMatch(Message, frozen=True, kw_only=True):
     belief: BeliefSummary | None = None  # None: the frame was not correlated around the believed position
     ground: GroundPlane | None = None  # None: no DEM
     search: SearchResult = SearchResult()
-    # Scale of the image's x axis over that of its y axis, where the map shows that it is not 1
+    # Scale of the image's x axis over that of its y axis, by the map; None: the map does not tell
     aspect_ratio: float | None = None
     # Log likelihood ratio [nats] of this frame: the alternative position of its Prediction over ``place``
     alternative_nats: float | None = None

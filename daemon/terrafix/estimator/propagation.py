@@ -186,7 +186,7 @@ class Propagation:
             return self._reset_standstill(predicted, verdicts)
         self._doubt.note(odometry.verdict, odometry.motion_innovation, frame.t_s)
         # Images that are known to be turned or mirrored explain impossible motions.
-        timed_out = state.orientation.fault is None and self._doubt.is_timed_out(frame.t_s)
+        timed_out = state.orientation.fault is None and self._doubt.is_timed_out(frame.t_s, state.last_fix_s)
         if timed_out and predicted.increment is not None:
             return self._reset_unknown_velocity(predicted, verdicts)
         if self._is_velocity_wrong(predicted) and predicted.increment is not None:

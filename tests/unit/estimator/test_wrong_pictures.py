@@ -270,18 +270,14 @@ def test_inertial_readings_go_on_from_the_velocity_before_the_images_that_contra
     assert estimate.velocity_sigma_mps == pytest.approx(SHIFT_MPS, rel=0.2)
 
 
-@pytest.mark.parametrize("ratio", [None, 0.8])
-def test_places_that_images_of_another_shape_have_shown_count_no_more_once_they_have_the_described_one(
-    ratio: float | None,
-) -> None:
+@pytest.mark.parametrize("nats", [0.0, -2.0])
+def test_places_that_wrong_images_have_shown_count_until_the_next_ones_fit_the_estimate_alone(nats: float) -> None:
     """Two map matches that agree with each other, 40 m beside the position, and then right ones."""
     flight, run = Flight(60, seed=5, fix_every=3), EstimatorRun().fly(Flight(60, seed=5, fix_every=3), 0, 30)
     for i in range(30, 40):
-        messages = flight.messages(i)
-        if i < 36:
-            e_m, n_m, up_m = position_of(flight.fix(i))
-            match = with_pose(flight.fix(i), p_c_in_w_m=(e_m + 40.0, n_m, up_m))
-            shown = msgspec.structs.replace(match, aspect_ratio=ratio)
-            messages = [shown if isinstance(message, MapMatch) else message for message in messages]
-        run.feed(messages)
-    assert (sigma_of(run.estimate(39)) < 7.0) is (ratio is not None)
+        match = flight.fix(i)
+        e_m, n_m, up_m = position_of(match)
+        wrong = with_pose(match, p_c_in_w_m=(e_m + 40.0, n_m, up_m))
+        shown = wrong if i < 36 else msgspec.structs.replace(match, alternative_nats=nats)
+        run.feed([shown if isinstance(message, MapMatch) else message for message in flight.messages(i)])
+    assert (sigma_of(run.estimate(39)) < 7.0) is (nats < 0.0)

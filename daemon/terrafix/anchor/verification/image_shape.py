@@ -33,8 +33,8 @@ STRETCHED_SHARE = STRETCH - 1.0
 
 
 class ImageShape:
-    """Posterior of another shape, one for each ratio of the axes. ``ratio``: that of the images, x over y, while it is
-    certain that it is not 1; else None."""
+    """Posterior of another shape, one for each ratio of the axes. ``ratio``: that of the images, x over y, where it is
+    certain; 1: as described."""
 
     def __init__(self) -> None:
         limits = {Cause.DESCRIPTION: Range(STATED.prior, -CERTAIN, CERTAIN)}
@@ -59,7 +59,7 @@ class ImageShape:
         if log_odds >= CERTAIN:
             self.ratio = ratio
         elif log_odds < 0.0:
-            self.ratio = None
+            self.ratio = 1.0 if log_odds <= -CERTAIN else None
 
     def sigma_m(self, agl_m: float) -> float:
         """1-sigma per axis [m] that the mixture component of another shape adds to a position ``agl_m`` above

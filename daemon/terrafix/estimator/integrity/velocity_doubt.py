@@ -64,13 +64,14 @@ class VelocityDoubt:
         elif innovation is not None and not inertial:
             self.refused = replace(self.refused, inertial=False)
 
-    def is_timed_out(self, t_s: float) -> bool:
-        """Whether impossible motions have gone on for so long that velocity may be what is wrong: for as long as
-        motions that agreed had shown it before."""
+    def is_timed_out(self, t_s: float, fix_s: float | None) -> bool:
+        """Whether impossible motions have gone on for so long, since the last map match at ``fix_s``, that velocity may
+        be what is wrong: for as long as motions that agreed had shown it before."""
         if self.refused is None:
             return False
         since_s, shown_s = self.refused.since_s, self._shown_since_s
-        return t_s - since_s >= min(MOTION_TIMEOUT_S, math.inf if shown_s is None else since_s - shown_s)
+        limit_s = min(MOTION_TIMEOUT_S, math.inf if shown_s is None else since_s - shown_s)
+        return t_s - max(since_s, -math.inf if fix_s is None else fix_s) >= limit_s
 
     def is_to_one_side(self, innovation: MotionInnovation, before: KnownMotion) -> bool:
         """Whether innovations of fused odometry have kept one sign for so long that velocity is what is wrong.

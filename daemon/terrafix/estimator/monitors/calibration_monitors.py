@@ -151,11 +151,13 @@ class Monitors:
     def on_map_match(self, match: MapMatch, telemetry: Telemetry, *, accepted: bool) -> None:
         """``accepted``: the match has entered the graph. Rejected poses are used as well, because one whose height is
         off is rarely accepted."""
-        self._shape.by_map = match.aspect_ratio
+        self._shape.by_map = None if match.aspect_ratio == 1.0 else match.aspect_ratio
         if match.ground is not None and self._origin.ground_amsl_m is not None:
             self._rise_m = match.ground.amsl_m - self._origin.ground_amsl_m
         pose = match.verdict is Verdict.ACCEPTED and not match.position_only
         found = accepted and pose
+        if found and match.aspect_ratio == 1.0 and self._shape.ratio is not None:  # the map outweighs odometry
+            self._shape = ShapeMonitor()
         # A coarse fix in the graph counts neither as found nor as nothing found. 15 % of the correlations of correct
         # flights give one, and 3 of 900 with a wrong mount, heading, focal length or map: too rare to be measured.
         nothing = not accepted and match.frame_id == self._textured and match.verdict not in NOT_CORRELATED

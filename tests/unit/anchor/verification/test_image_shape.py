@@ -29,7 +29,7 @@ def test_images_that_fit_the_map_as_described_are_not_tested_again_until_one_fit
     assert shape.is_in_doubt(9.0)
     for _ in range(2):
         shape.add(scores(described=8.0))
-    assert shape.ratio is None and shape.sigma_m(100.0) == 0.0
+    assert shape.ratio == 1.0 and shape.sigma_m(100.0) == 0.0
     assert not shape.is_in_doubt(WRONG_SCORE + 0.1) and shape.is_in_doubt(WRONG_SCORE - 0.1)
 
 
@@ -43,7 +43,7 @@ def test_a_stretched_axis_widens_the_claim_at_once_and_is_named_when_it_is_certa
     assert named == [None, None, ratio, ratio]
     for _ in range(3):
         shape.add(scores(described=8.0))
-    assert shape.ratio is None and shape.sigma_m(100.0) == 0.0
+    assert shape.ratio == 1.0 and shape.sigma_m(100.0) == 0.0
 
 
 def test_a_lead_that_wrong_places_have_is_no_evidence() -> None:
@@ -57,7 +57,7 @@ def test_a_height_that_is_wrong_changes_both_axes_and_not_the_shape() -> None:
     shape = ImageShape()
     for _ in range(4):
         shape.add(scores(both=8.0, x=6.0))
-    assert shape.ratio is None and shape.sigma_m(100.0) == 0.0
+    assert shape.ratio == 1.0 and shape.sigma_m(100.0) == 0.0
 
 
 @pytest.mark.parametrize("of_image", [(1.0, 4.0 / 3.0), (4.0 / 3.0, 1.0), (1.0, 1.0)])
@@ -73,7 +73,7 @@ def test_the_anchor_names_images_that_are_squeezed_from_the_first_frame_on(
         match, *_ = node.on(predicted(i, 5.0, at_m=at_m, step_m=8.0))
         assert isinstance(match, MapMatch)
         assert (match.search.sigma_m > 0.1 * AGL_M) is squeezed
-    named = None if not squeezed else next(r for r, shapes in OTHER_SHAPES.items() if (r > 1.0) is (of_image[0] > 1.0))
+    named = 1.0 if not squeezed else next(r for r, shapes in OTHER_SHAPES.items() if (r > 1.0) is (of_image[0] > 1.0))
     assert match.aspect_ratio == named
 
 

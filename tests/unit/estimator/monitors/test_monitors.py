@@ -157,6 +157,18 @@ def test_a_ratio_of_the_axes_that_the_map_shows_is_a_fault_until_it_shows_none()
     ]
 
 
+@pytest.mark.parametrize(("by_map", "accepted", "ends"), [(1.0, True, True), (1.0, False, False), (None, True, False)])
+def test_a_ratio_of_the_axes_by_odometry_ends_where_an_accepted_match_shows_the_described_one(
+    by_map: float | None, *, accepted: bool, ends: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight, monitors, telemetry = Flight(2, fix_every=1), Monitors(ORIGIN), Telemetry()
+    monkeypatch.setattr(monitors._shape._tests[0.75], "active", True)
+    assert [change.quantity for change in monitors.take_changes(t_ns(0))] == ["aspect ratio"]
+    match = msgspec.structs.replace(flight.fix(1), aspect_ratio=by_map)
+    monitors.on_map_match(match, telemetry, accepted=accepted)
+    assert [change.active for change in monitors.take_changes(t_ns(1))] == ([False] if ends else [])
+
+
 def _scaled_x(odometry: Odometry, factor: float) -> Odometry:
     pairs = [(factor * a, b, factor * c, d) for a, b, c, d in odometry.two_view]
     return msgspec.structs.replace(odometry, two_view=pairs)
