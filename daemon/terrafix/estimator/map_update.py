@@ -243,7 +243,7 @@ class MapUpdate:
         predicted = state.graph.state(node).pose
         predicted_cov, t_s = state.covariance(node), state.graph.time_of(node)
         position = measurement.position_innovation(predicted, predicted_cov)
-        offset, apart = position.residual, position.covariance
+        offset = position.residual
         run, other = self._rejected, self.hypotheses.other
         claim_m2 = tangent_to_world(predicted_cov, predicted.rotation().matrix())[HORIZONTAL, HORIZONTAL]
         here_m, coarse = predicted.translation()[:2], match.position_only
@@ -262,12 +262,14 @@ class MapUpdate:
         if found or (run.poses if certain else len(run.offsets_m)) >= MIN_CONSISTENT:
             assert state.last is not None
             first_frame = state.last.frame_id + 1
-            other.spawn(run.offsets_m, apart, first_frame)
+            apart = levelled_innovation(measurement, predicted, predicted_cov)
+            if not apart.is_accepted:  # by a pose that is off in heading or height alone there is no other position
+                other.spawn(run.offsets_m, apart.covariance, first_frame)
             # Before the first fix only the start coordinate supports the graph: as much as one such pose against it.
             first = state.last_fix_s is None and match.inliers >= OUTWEIGHS_START
             needed = (MIN_CONSISTENT, 0.0) if first else (RECOVER_AFTER, RECOVER_OVER * height)
             if (found or run.is_confirmed(*needed, poses_only=certain)) and _place_mass(match) >= RECOVER_MASS:
-                other.switch(offset, apart, first_frame)
+                other.switch(offset, apart.covariance, first_frame)
                 return self._reset(match, self._past(node), measurement, "restarted")
         detail = f"horizontally {float(np.hypot(*offset)):.0f} m from the estimate"
         off = None if coarse else position

@@ -1,6 +1,7 @@
 """Whether a frame fits the map better at the position of the estimate or at its alternative position, which map matches
 support that contradict the estimate (estimator/integrity/alternative_position.py)."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,18 +33,19 @@ def alternative_nats(prediction: Prediction, mode: Mode, seen: Observation) -> f
     map does not reach it.
 
     The image is shifted against the prediction by the error of position and tilt, at both places by as much. Within a
-    mode of the belief the best cell counts, since two places are not known to a cell."""
+    mode of the belief the best cell counts, as long as it is nearer to the alternative."""
     if prediction.alternative_m is None:
         return None
-    off_e_m, off_n_m = mode.e_m - prediction.p_c_in_w_m[0], mode.n_m - prediction.p_c_in_w_m[1]
-    there_m = prediction.alternative_m[0] + off_e_m, prediction.alternative_m[1] + off_n_m
+    away_e_m, away_n_m = np.subtract(prediction.alternative_m, prediction.p_c_in_w_m[:2]).tolist()
+    there_m = mode.e_m + away_e_m, mode.n_m + away_n_m
     hypothesis, score = seen.correlation.best_at(mode.e_m, mode.n_m)
     cell_m = belief_cell_m(seen.view.agl_m, seen.correlation.cell_m)
     view, window = replace(seen.view, e_m=there_m[0], n_m=there_m[1]), Square(there_m, MIN_HALF_CELLS * cell_m)
     found = seen.layer.matcher.correlate_as(seen.image, view, window, (hypothesis,))
     if found.verdict is not Verdict.ACCEPTED:
         return None
-    there = found.surfaces[0].at(*there_m, MODE_RADIUS_CELLS * cell_m)
+    radius_m = min(MODE_RADIUS_CELLS * cell_m, 0.5 * math.hypot(away_e_m, away_n_m))
+    there = found.surfaces[0].at(*there_m, radius_m)
     return weighed(there, score, seen.weight)
 
 
