@@ -356,9 +356,9 @@ class EstimatorNode(NodeBase):
                 time_offset.forget_images()
             else:
                 if jump is not None and jump[0] == frame.t_s:
-                    self._time_contradicted(stamped_ns, jump[1], result.placed, by_map=False)
+                    self._time_contradicted(stamped_ns, jump[1], result.placed, odometry.keyframe_id)
                 elif time_offset.is_held and result.off is not None:
-                    self._time_contradicted(stamped_ns, result.off, result.placed, by_map=False)
+                    self._time_contradicted(stamped_ns, result.off, result.placed, odometry.keyframe_id)
                 time_offset.add(msgspec.structs.replace(odometry, t_ns=stamped_ns), self._telemetry, agl_m)
             yield from time_offset.take_changes(odometry.t_ns)
         yield from self._refused_pictures(odometry.t_ns, result.verdict, estimator.state, frame.attitude)
@@ -373,12 +373,13 @@ class EstimatorNode(NodeBase):
         yield estimate
         yield from odometry_link(estimator, result, odometry.t_ns)  # last: it delays nothing
 
-    def _time_contradicted(self, t_ns: int, off: Innovation, frame: FrameState, *, by_map: bool) -> None:
-        """``off``: a frame at the uncorrected ``t_ns`` the estimate; ``frame``: the newest one."""
+    def _time_contradicted(self, t_ns: int, off: Innovation, frame: FrameState, keyframe_id: int = -1) -> None:
+        """``off``: the frame at the uncorrected ``t_ns`` from the estimate, by images since ``keyframe_id``; -1: by the
+        map. ``frame``: the newest one."""
         assert self._flight is not None
         agl_m = max(self._flight.estimator.terrain.height_above_m(frame.pose.translation()), 1.0)
-        seen = Contradiction(t_ns, off, frame.velocity_mps[:2], agl_m)
-        self._flight.time_offset.contradict(seen, self._telemetry, by_map=by_map)
+        seen = Contradiction(t_ns, off, frame.velocity_mps[:2], agl_m, keyframe_id)
+        self._flight.time_offset.contradict(seen, self._telemetry, by_map=keyframe_id < 0)
 
     def _refused_pictures(
         self, t_ns: int, verdict: Verdict, state: FilterState, attitude: Attitude
@@ -534,7 +535,7 @@ class EstimatorNode(NodeBase):
             self._unseen.add(match.t_ns, fragment.fragment_id, at, shown=accepted)
         if result.off is not None and estimator.last is not None and (flight.time_offset.is_held or not accepted):
             stamp_ns = match.t_ns + round(flight.time_offset.applied_s * 1e9)
-            self._time_contradicted(stamp_ns, result.off, estimator.last, by_map=True)
+            self._time_contradicted(stamp_ns, result.off, estimator.last)
             yield from flight.time_offset.take_changes(match.t_ns)
         if accepted:
             flight.time_offset.agree()

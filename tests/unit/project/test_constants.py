@@ -6,7 +6,7 @@ from collections import Counter, defaultdict
 
 from constants_ledger import ROOT, constants
 
-MAX_TUNED = 457  # lower it when a constant gets a measurement or a specification; never raise it
+MAX_TUNED = 456  # lower it when a constant gets a measurement or a specification; never raise it
 TERRAFIX = ROOT / "daemon" / "terrafix"
 NAME = r"_?[A-Z][A-Z0-9_]+"
 ASSIGNED = re.compile(rf"^({NAME}(?:, {NAME})*)(?:: [^=\n]+)? = ", re.MULTILINE)  # at the top of a module

@@ -16,12 +16,12 @@ from terrafix.anchor.matching.point_mass_filter import (
 )
 from terrafix.messages import Prediction, Verdict
 
-# Largest log likelihood ratio of a full observation [nats]: one frame alone does not exclude a place
-MAX_NATS = 2.0  # [tuned: the gain of a full observation in lock_monitor.py]
+# Largest log likelihood ratio of a full observation [nats]: one frame alone does not exclude a place. [tuned]
+MAX_PLACE_NATS = 2.0
 
 
 @dataclass(frozen=True)
-class Square:
+class PlaceWindow:
     """SearchWindow about a place."""
 
     centre: tuple[float, float]
@@ -40,7 +40,7 @@ def alternative_nats(prediction: Prediction, mode: Mode, seen: Observation) -> f
     there_m = mode.e_m + away_e_m, mode.n_m + away_n_m
     hypothesis, score = seen.correlation.best_at(mode.e_m, mode.n_m)
     cell_m = belief_cell_m(seen.view.agl_m, seen.correlation.cell_m)
-    view, window = replace(seen.view, e_m=there_m[0], n_m=there_m[1]), Square(there_m, MIN_HALF_CELLS * cell_m)
+    view, window = replace(seen.view, e_m=there_m[0], n_m=there_m[1]), PlaceWindow(there_m, MIN_HALF_CELLS * cell_m)
     found = seen.layer.matcher.correlate_as(seen.image, view, window, (hypothesis,))
     if found.verdict is not Verdict.ACCEPTED:
         return None
@@ -53,4 +53,4 @@ def weighed(there: float, here: float, weight: float) -> float:
     """Log likelihood ratio [nats] by the standardised correlations at two places, of an observation with ``weight``
     0..1."""
     ratio = log_likelihood_ratio(np.array([there, here]))
-    return weight * float(np.clip(ratio[0] - ratio[1], -MAX_NATS, MAX_NATS))
+    return weight * float(np.clip(ratio[0] - ratio[1], -MAX_PLACE_NATS, MAX_PLACE_NATS))

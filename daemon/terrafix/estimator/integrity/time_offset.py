@@ -72,13 +72,14 @@ QUANTITY = "camera time"
 @dataclass(frozen=True)
 class Contradiction:
     """A frame at the uncorrected ``t_ns``, which images or map place ``off`` the estimate (2,), which moves with
-    ``velocity_mps`` (2,) at ``agl_m`` above the ground. ``agreed_sigma_s``: 1-sigma of the offset with which that
-    agrees."""
+    ``velocity_mps`` (2,) at ``agl_m`` above the ground. ``keyframe_id``: of the motion that images show; -1: none.
+    ``agreed_sigma_s``: 1-sigma of the offset with which that agrees."""
 
     t_ns: int
     off: Innovation
     velocity_mps: np.ndarray
     agl_m: float
+    keyframe_id: int = -1
     agreed_sigma_s: float = 0.0
 
     def back_m(self, agreed_s: float, telemetry: Telemetry) -> np.ndarray:
@@ -164,6 +165,7 @@ class TimeOffset:
         self._agreed: tuple[float, float] | None = None  # its mean and 1-sigma
         self._new_ns, self._repeated_ns = 0, 0  # stamp of the newest frame with a new view, and of a repeat since
         self._contradicted: set[str] = set()
+        self._before_jump: tuple[int, np.ndarray] | None = None  # stamp of images that have jumped, mass without that
         self._held = False  # repeats came before the newest new view, and the map has not agreed since
         self._jumps = False  # what has contradicted is known, and not subtracted yet
 
@@ -197,17 +199,21 @@ class TimeOffset:
     def agree(self) -> None:
         """The map has confirmed the position, or moved it to where the images are."""
         self._jumps, self._held = self._jumps and self._held, False  # a match of the frame that jumped, at its old time
-        self._agreed, self._contradicted = None, set()
+        self._agreed, self._contradicted, self._before_jump = None, set(), None
 
     def contradict(self, seen: Contradiction, telemetry: Telemetry, *, by_map: bool) -> None:
         """An offset that jumps moves the image along the way that was flown. A wrong motion of images lies along it,
         too, or anywhere, as a wrong pose on the map does (``by_map``). The first of each counts: those that follow
-        repeat it."""
+        repeat it, or show that the images are others."""
         kind, rate = ("map", P_REJECTED) if by_map else ("images", P_IMPLAUSIBLE)
         under_way = self._agreed is None and abs(self.estimate[0] - self.applied_s) > FAR_S
+        if kind in self._contradicted:
+            self._refute_jump(seen)
         if kind in self._contradicted or under_way:  # a correction that is under way moves the frames as well
             return
         self._contradicted.add(kind)
+        if not by_map:
+            self._before_jump = seen.t_ns, self._mass
         agreed_s, sigma_s = self._agreed = self._agreed or self._agreement
         seen = replace(seen, agreed_sigma_s=sigma_s)
         self.forget_images()
@@ -220,6 +226,15 @@ class TimeOffset:
         mass *= jumped + rate * anywhere
         self._jumps = True
         self._mass, self._at_ns, self._density = mass / mass.sum(), max(seen.t_ns, self._at_ns or seen.t_ns), None
+
+    def _refute_jump(self, seen: Contradiction) -> None:
+        """Images that only come at another time move as the vehicle does from the first of them on."""
+        if self._before_jump is None or "map" in self._contradicted:
+            return
+        jumped_ns, mass = self._before_jump
+        if self._stamps_ns.get(seen.keyframe_id, -1) >= jumped_ns:
+            self.forget_images()
+            self._mass, self._density, self._jumps = mass, None, False
 
     def view(self, t_ns: int, *, repeated: bool) -> None:
         """A frame shows a new view of the ground, or one of before. Repeats may have gone into a buffer: the next new

@@ -8,7 +8,7 @@ from anchor_rig import started
 from single_map_place import SIDE_M, TRUE_M, R, predicted
 from terrafix.anchor.localizer import MIN_OBSERVATION_WEIGHT
 from terrafix.anchor.node import AnchorNode
-from terrafix.anchor.verification.alternative_place import MAX_NATS
+from terrafix.anchor.verification.alternative_place import MAX_PLACE_NATS
 from terrafix.messages import MapMatch
 from textured_ground import GSD_M, PINHOLE, view
 
@@ -30,8 +30,8 @@ def test_a_frame_that_fits_at_the_estimate_alone_is_full_evidence_once_for_the_s
     node, frames = started(ground)
     for frame_id in (1, 2):
         frames.put(frame_id, view(ground, PINHOLE, R, TRUE_M))
-    assert nats(node, 1, (-90.0, 60.0)) == -MAX_NATS
-    assert nats(node, 2, (-90.0, 60.0)) == pytest.approx(-MAX_NATS * MIN_OBSERVATION_WEIGHT)
+    assert nats(node, 1, (-90.0, 60.0)) == -MAX_PLACE_NATS
+    assert nats(node, 2, (-90.0, 60.0)) == pytest.approx(-MAX_PLACE_NATS * MIN_OBSERVATION_WEIGHT)
 
 
 def test_a_frame_that_fits_alike_at_both_places_is_no_evidence(ground: np.ndarray) -> None:
@@ -43,7 +43,7 @@ def test_a_frame_that_fits_alike_at_both_places_is_no_evidence(ground: np.ndarra
     node, frames = started(repeated)
     frames.put(1, view(repeated, PINHOLE, R, TRUE_M))
     found = nats(node, 1, (-PERIOD_M, 0.0))
-    assert found is not None and abs(found) < 0.5 * MAX_NATS
+    assert found is not None and abs(found) < 0.5 * MAX_PLACE_NATS
 
 
 @pytest.mark.parametrize("away_m", [None, (10.0 * SIDE_M, 0.0)])

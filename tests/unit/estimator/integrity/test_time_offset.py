@@ -330,3 +330,20 @@ def test_a_vehicle_that_hovers_learns_nothing_of_the_time_from_an_image_that_jum
     off = Innovation(np.array([-20.0, 0.0]), np.eye(2), GATE[2])
     offset.contradict(Contradiction(0, off, np.zeros(2), 120.0), Telemetry(), by_map=False)
     assert offset.density == pytest.approx(before.density)
+
+
+@pytest.mark.parametrize(
+    ("keyframe_ns", "by_map", "late_s"), [(0, False, 1.4), (10**9, False, 0.0), (10**9, True, 1.4)]
+)
+def test_images_that_jump_and_go_on_with_impossible_motions_tell_nothing_of_the_time(
+    keyframe_ns: int, late_s: float, *, by_map: bool
+) -> None:
+    """The next motion, since a keyframe before or after the jump; the map may have confirmed that."""
+    offset = TimeOffset(R_B_C)
+    offset.buffered, offset._stamps_ns = True, {7: keyframe_ns}
+    for at_ns, off_m in ((10**9, (-28.0, 0.5)), (2 * 10**9, (5.0, 30.0))):
+        seen = Contradiction(at_ns, Innovation(np.array(off_m), np.eye(2), GATE[2]), np.array([20.0, 0.0]), 120.0, 7)
+        offset.contradict(seen, Telemetry(), by_map=False)
+        if by_map:
+            offset.contradict(seen, Telemetry(), by_map=True)
+    assert offset.estimate[0] == pytest.approx(late_s, abs=0.2)
