@@ -338,7 +338,7 @@ class Localizer:
         """Updates the posterior of another shape of the images, after as much new ground as counts in full: the same
         ground would give the same scores. ``hypothesis``, ``score``: of the best mode."""
         self._untested_weight += seen.weight
-        if seen.layer.drawn or self._untested_weight < 1.0 or not self._shape.is_in_doubt(score):
+        if seen.layer.drawn or not self._shape.is_due(score, self._untested_weight):
             return
         hypotheses = tuple(replace(hypothesis, stretch=stretch) for stretch in STRETCHES[1:])
         found = seen.layer.matcher.correlate_as(seen.image, seen.view, belief, hypotheses)

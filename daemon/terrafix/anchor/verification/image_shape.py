@@ -42,10 +42,14 @@ class ImageShape:
         self._tested = False
         self.ratio: float | None = None
 
-    def is_in_doubt(self, score: float) -> bool:
-        """Whether a frame with this standardised correlation, as described, is to be tested: one of a wrong place may
-        have another shape than those before it."""
-        return score < WRONG_SCORE or any(odds > -CERTAIN for odds in self._log_odds.values())
+    def is_due(self, score: float, new_ground: float) -> bool:
+        """Whether a frame with this standardised correlation, as described, is to be tested, ``new_ground`` after the
+        last one (1: counts in full). One that fits as a wrong place does may have another shape than those before it,
+        and one that fits better, after others that had another shape, the described one."""
+        odds = max(self._log_odds.values())
+        if new_ground >= 1.0:
+            return score < WRONG_SCORE or odds > -CERTAIN
+        return score >= WRONG_SCORE and odds > 0.0
 
     def add(self, scores: Mapping[Stretch, float]) -> None:
         """``scores``: highest standardised correlation of a frame with each of STRETCHES."""

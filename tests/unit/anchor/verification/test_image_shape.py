@@ -26,11 +26,11 @@ def scores(**best: float) -> dict[Stretch, float]:
 
 def test_images_that_fit_the_map_as_described_are_not_tested_again_until_one_fits_badly() -> None:
     shape = ImageShape()
-    assert shape.is_in_doubt(9.0)
+    assert shape.is_due(9.0, 1.0)
     for _ in range(2):
         shape.add(scores(described=8.0))
     assert shape.ratio == 1.0 and shape.sigma_m(100.0) == 0.0
-    assert not shape.is_in_doubt(WRONG_SCORE + 0.1) and shape.is_in_doubt(WRONG_SCORE - 0.1)
+    assert not shape.is_due(WRONG_SCORE + 0.1, 1.0) and shape.is_due(WRONG_SCORE - 0.1, 1.0)
 
 
 @pytest.mark.parametrize(("axis", "ratio"), [("x", 1.25), ("y", 0.8)])
@@ -41,6 +41,7 @@ def test_a_stretched_axis_widens_the_claim_at_once_and_is_named_when_it_is_certa
         named.append(shape.ratio)
         assert shape.sigma_m(100.0) > 15.0
     assert named == [None, None, ratio, ratio]
+    assert shape.is_due(WRONG_SCORE + 0.1, 0.1) and not shape.is_due(WRONG_SCORE - 0.1, 0.1)
     for _ in range(3):
         shape.add(scores(described=8.0))
     assert shape.ratio == 1.0 and shape.sigma_m(100.0) == 0.0
