@@ -18,7 +18,7 @@ from terrafix.map.dem import ElevationView
 from terrafix.map.descriptor_table import StoredDescriptors
 from terrafix.map.format import TILE_PX, Layer, Manifest
 from terrafix.map.imagery import LayerView
-from terrafix.map.tile_cache import Key, TileStore
+from terrafix.map.tile_cache import TileStore
 from terrafix.map.vectors import Feature, features_sha256_of, read_features
 from terrafix.map.verify import check_signature, connect, read_manifest
 
@@ -29,7 +29,7 @@ DATABASE_ERRORS = (sqlite3.DatabaseError, UnicodeDecodeError)
 class MapPackage:
     """An open package, read only. Not thread-safe. Closed by ``close``, or with the last of its views.
 
-    A tile whose sha256 differs from the recorded one counts as missing and is listed in ``damaged_tiles``: a bad block
+    A tile whose sha256 differs from the recorded one counts as missing and is listed in ``tiles.damaged``: a bad block
     on a disk costs one tile in flight, not the map. ``verify`` reads everything and raises."""
 
     def __init__(self, path: Path, db: sqlite3.Connection, manifest: Manifest) -> None:
@@ -85,11 +85,6 @@ class MapPackage:
                 f"{self.path}: the file was altered since it was built or signed, outside of tiles and manifest; "
                 "build or copy the package again"
             )
-
-    @property
-    def damaged_tiles(self) -> set[Key]:
-        """(table, zoom, column, row) of the requested tiles that do not match their recorded hash."""
-        return self.tiles.damaged
 
     def layer(self, table: str | None = None) -> Layer:
         """An imagery layer by table name; None: the newest. Raises MapError."""

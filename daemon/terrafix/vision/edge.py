@@ -56,6 +56,7 @@ class SourceEdge:
         self._zero_ns = 0  # time zero of the source; set when the reader starts
         self._first_id = 0
         self._changed = threading.Condition()
+        self._selected = source.live and self._rate is not None and source.select(self._takes)  # by the source
         self._shots: deque[Shot] = deque()
         self._exposures = ReportedExposures()
         self._dropped: deque[m.Message] = deque(maxlen=MAX_DROPPED_MESSAGES)
@@ -72,9 +73,8 @@ class SourceEdge:
             self._reading = self._start(now_ns)
         if not self._origin_published:
             self._origin_published = True
-            origin = (
-                self._source.origin() if self._bounds is None else with_map_center(self._source.origin(), self._bounds)
-            )
+            origin = self._source.origin()
+            origin = origin if self._bounds is None else with_map_center(origin, self._bounds)
             ground_m = self._ground_amsl_m if origin.ground_amsl_m is None else origin.ground_amsl_m
             said = m.SourceFacts(t_ns=self._zero_ns, facts=tuple(facts_of(self._source)))
             flight_id = live_flight_id(self._zero_ns)
@@ -155,9 +155,13 @@ class SourceEdge:
         others = tuple(msgspec.structs.replace(other, t_ns=other.t_ns + shift_ns) for other in shot.others)
         return Shot(frame, states, shot.image, imu, others)
 
+    def _takes(self, t_ns: int) -> bool:
+        with self._changed:
+            return self._rate is None or self._rate.takes_frame(t_ns)
+
     def _push(self, shot: Shot) -> None:
         with self._changed:
-            if self._rate is not None and not self._rate.takes_frame(shot.frame.t_ns):
+            if not self._selected and not self._takes(shot.frame.t_ns):
                 self._dropped.extend((*shot.imu, *shot.states, *shot.others))
                 return
             if not self._realtime and not self._source.live:  # lossless: the reader blocks until there is room

@@ -83,13 +83,8 @@ class FrameRateLimit:
         self._state, self._state_ns = known, now_ns
         taken_hz = min(offered_hz, NS_PER_S / (self._period_ns[self.band] or 1)) / self._every
         taken_hz *= 1.0 - sum(taken.lost for taken in self._newest.values()) / max(len(self._newest), 1)
-        rate = FrameRate(
-            t_ns=now_ns,
-            offered_hz=round(offered_hz, 2),
-            taken_hz=round(taken_hz, 2),
-            every=self._every,
-            computer_too_slow=slow,
-        )
+        offered, taken = round(offered_hz, 2), round(taken_hz, 2)
+        rate = FrameRate(t_ns=now_ns, offered_hz=offered, taken_hz=taken, every=self._every, computer_too_slow=slow)
         if slow == before[0] and not (slow and self._every > before[1]):
             return [rate]
         t_ns = now_ns if before[0] or self._slow_since_ns is None else self._slow_since_ns

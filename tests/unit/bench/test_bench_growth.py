@@ -4,6 +4,7 @@ import ctypes
 import gc
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,29 +12,17 @@ import pytest
 
 from terrafix.core.allocator import _Mallinfo2
 from terrafix.estimator.estimator import Estimator
-from terrafix.estimator.filter_state import FrameInput
-from terrafix.estimator.measurements.telemetry_buffer import Telemetry
-from terrafix.messages import Imu
 from terrafix_lab.bench.growth import estimator_cost, map_size
-from terrafix_lab.bench.growth.stream import FIX_EVERY, FRAME_S, frame_messages, origin
+from terrafix_lab.bench.growth.stream import FIX_EVERY, origin
 
 
 def test_the_estimator_follows_the_synthetic_flight() -> None:
     """The messages must describe one motion, or the benchmark would time a lost
     estimator."""
-    estimator, telemetry = Estimator(origin()), Telemetry()
-    frames, rejected, inertial = 140, 0, 0
-    for frame in frame_messages(frames):
-        for message in frame.telemetry:
-            (telemetry.add_imu if isinstance(message, Imu) else telemetry.add)(message)  # type: ignore[operator]
-        t_ns = frame.odometry.t_ns
-        imu, attitude = telemetry.world_acceleration, telemetry.at(t_ns)
-        propagated = estimator.feed_frame(
-            FrameInput(frame.odometry.frame_id, t_ns * 1e-9, frame.odometry, attitude, imu)
-        )
-        inertial += telemetry.world_acceleration(t_ns - round(FRAME_S * 1e9), t_ns) is not None
-        if frame.match is not None:
-            rejected += estimator.feed_map_match(frame.match).verdict != "accepted"
+    estimator, frames, rejected, inertial = Estimator(origin()), 140, 0, 0
+    for frame, propagated, matched, _ in estimator_cost.flown(estimator, frames):
+        inertial += estimator.state.continuity.last_increment_inertial is True
+        rejected += matched is not None and matched.verdict != "accepted"
         error_m = propagated.placed.pose.translation() - frame.p_m
         assert np.hypot(*error_m[:2]) < (40.0 if frame.odometry.frame_id < 5 else 6.0)
     assert inertial == frames - 1
@@ -53,7 +42,7 @@ def test_what_the_estimator_keeps_of_each_frame_is_small() -> None:
     """In Python and in GTSAM, while the history retains more and more nodes: 2 kB a frame, and 44 kB if factors were
     parts of larger matrices. A window has some 40 factors more or less, 10 kB each."""
     estimator, used = Estimator(origin()), []
-    for frame, _ in enumerate(estimator_cost._flown(estimator, 300)):
+    for frame, _ in enumerate(estimator_cost.flown(estimator, 300)):
         if frame in (99, 299):
             gc.collect()
             used.append(allocated_bytes())
@@ -61,7 +50,17 @@ def test_what_the_estimator_keeps_of_each_frame_is_small() -> None:
 
 
 @pytest.mark.slow
-def test_the_growth_benchmark_has_all_fields() -> None:
+def test_the_growth_benchmark_has_all_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the graph has begun anew late in the flight, and has fewer nodes than before."""
+    flown = estimator_cost.flown
+
+    def begun_anew(estimator: Estimator, frames: int) -> Iterator[estimator_cost.Flown]:
+        for frame in flown(estimator, frames):
+            if frame[0].odometry.frame_id == frames - 5:
+                estimator.graph._rebuild()
+            yield frame
+
+    monkeypatch.setattr(estimator_cost, "flown", begun_anew)
     found = estimator_cost.measure(30)
     assert found["frames"] == 30 and found["peak_memory_mb"] >= found["memory_in_flight_mb"] > 50.0
     assert list(found["covariance_cpu_ms"]) == [

@@ -9,12 +9,7 @@ from terrafix_lab.bench.restart import Kill, missed, summary
 
 @pytest.mark.parametrize(
     ("fix_s", "is_missed"),
-    [
-        ([0.0, 1.9, 3.9], False),
-        ([2.1, 2.1, 3.9], True),
-        ([0.0, 0.0, 4.1], True),
-        ([0.0, 0.0, None], True),
-    ],
+    [([0.0, 1.9, 3.9], False), ([2.1, 2.1, 3.9], True), ([0.0, 0.0, 4.1], True), ([0.0, 0.0, None], True)],
 )
 def test_a_row_misses_the_limits_by_its_median_its_worst_or_a_fix_that_did_not_come(
     fix_s: Sequence[float | None], is_missed: bool

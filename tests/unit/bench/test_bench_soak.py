@@ -57,4 +57,5 @@ def test_caches_that_fill_in_the_first_half_are_no_growth_and_what_grows_in_the_
 def test_the_output_of_a_record_has_its_rate_and_how_often_the_fix_was_lost(tmp_path: Path) -> None:
     write_record(tmp_path / "flight.mcap", [*live_messages(20), gps_input(11 * 10**9, 1), gps_input(12 * 10**9)])
     found = output_of(tmp_path / "flight.mcap")
+    assert len(found["delay_by_minute_ms"]) == 1 and found["taken_per_s"] == pytest.approx(20 / 9.0)
     assert found["frames_per_s"] == pytest.approx(19 / 9.0) and found["changes_per_min"] == pytest.approx(10.0)

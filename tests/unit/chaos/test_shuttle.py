@@ -1,16 +1,18 @@
 """The copter that flies forth and back without end: laps that join, and images that do not repeat."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from terrafix.core.errors import UsageError
 from terrafix.core.geodesy import LocalFrame
 from terrafix.vision.repeated_picture import HISTORY
 from terrafix_lab.chaos.scene import LEG_M, ChaosScene, course_of
-from terrafix_lab.chaos.shuttle import WAY, A, endless, lap_of, lap_steps
+from terrafix_lab.chaos.shuttle import WAY, A, endless, lap_of, lap_steps, shuttle_in
 from terrafix_lab.sim.autopilot.parameters import Kind
 from terrafix_lab.sim.flights.folder import FRAME_HZ, Flight
 from terrafix_lab.sim.flights.path import STEP_S, FlownPath
@@ -51,14 +53,20 @@ def flown() -> Flight:
     return Flight(Kind.COPTER, FRAME, ground, nothing, path, nothing, (0.0, 0.0), 500.0, path.duration_s)
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> ChaosScene:
-    lap = lap_of(flown())
+@pytest.fixture(params=[FRAME_HZ, 30.0])
+def scene(tmp_path: Path, request: pytest.FixtureRequest) -> ChaosScene:
+    lap = replace(lap_of(flown()), frame_hz=request.param)
     (tmp_path / "frames").mkdir()
     for i in range(len(lap.frame_times_s())):
         (tmp_path / "frames" / f"{i:04d}.jpg").write_bytes(str(i).encode())
     course_of(lap, tmp_path)
-    return endless(tmp_path)
+    return endless(tmp_path, request.param)
+
+
+def test_a_lap_of_parts_of_an_image_or_of_too_many_is_refused(tmp_path: Path) -> None:
+    for camera_hz in (0.0, 7.0, 120.0):
+        with pytest.raises(UsageError, match="multiple of 2 up to 60"):
+            shuttle_in(tmp_path, 1, camera_hz)
 
 
 def test_a_lap_lasts_whole_periods_of_the_camera_from_the_first_leg_until_it_is_flown_again() -> None:

@@ -107,13 +107,6 @@ def test_a_restart_after_the_end_publishes_the_end(tmp_path: Path, listen: Liste
     assert listener.frames == [] and listener.messages[-1].frames == 3  # type: ignore[attr-defined]
 
 
-def test_playback_without_real_time_drops_no_frame(tmp_path: Path, listen: Listen) -> None:
-    listener = listen(flight(tmp_path / "f", 12, step_s=60.0), realtime=False)
-    listener.until(listener.ended)
-    assert [f.frame_id for f in listener.frames] == list(range(12))
-    assert not any(f.error for f in listener.frames)
-
-
 def test_the_newest_frame_is_delivered_and_dropped_frames_are_published_with_an_error(
     tmp_path: Path, listen: Listen
 ) -> None:
@@ -176,26 +169,16 @@ def test_the_ground_height_of_the_map_is_the_default_for_a_source_without_one(
     assert isinstance(listener.messages[0], m.Origin) and listener.messages[0].ground_amsl_m == expected_m
 
 
-def test_in_a_hot_computer_frames_above_the_rate_are_left_out_and_their_telemetry_is_not(
-    tmp_path: Path, listen: Listen
+@pytest.mark.parametrize(("step_s", "realtime", "every"), [(0.05, True, 4), (60.0, False, 1)])
+def test_in_a_hot_computer_frames_above_the_rate_are_left_out_in_real_time_and_their_telemetry_is_not(
+    tmp_path: Path, listen: Listen, step_s: float, realtime: bool, every: int
 ) -> None:
     limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
-    listener = listen(flight(tmp_path / "f", 20, step_s=0.05), rate=limit)
+    listener = listen(flight(tmp_path / "f", 20, step_s=step_s), realtime=realtime, rate=limit)
     listener.edge.on_message(
         m.Health(t_ns=0, band=m.ThermalBand.HOT, temperature_c=85.0, throttled=False, disk_free_mb=None, cause="test")
     )
     listener.until(listener.ended)
-    assert [f.frame_id for f in listener.frames] == [0, 4, 8, 12, 16]
-    assert not any(f.error for f in listener.frames)
+    assert [(f.frame_id, f.error) for f in listener.frames] == [(i, "") for i in range(0, 20, every)]
     assert len([x for x in listener.messages if isinstance(x, m.VehicleState)]) == 20
     assert listener.messages[-1].frames == 20  # type: ignore[attr-defined]
-
-
-def test_a_recording_that_is_not_played_in_real_time_is_read_whole_in_a_hot_computer(
-    tmp_path: Path, listen: Listen
-) -> None:
-    limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
-    limit.band = m.ThermalBand.HOT
-    listener = listen(flight(tmp_path / "f", 12, step_s=0.05), realtime=False, rate=limit)
-    listener.until(listener.ended)
-    assert len(listener.frames) == 12

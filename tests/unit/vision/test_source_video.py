@@ -13,9 +13,13 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from source_folders import HEIGHT, TOML, WIDTH, flight, picture
 from terrafix.core.clock import now_ns
+from terrafix.core.config import HealthSection
 from terrafix.core.errors import SourceError
+from terrafix.core.frames import MemoryFrameStore
 from terrafix.core.mavlink.tlog import read_tlog
-from terrafix.messages import STAMP_SIGMA_S, Camera
+from terrafix.messages import STAMP_SIGMA_S, Camera, Frame
+from terrafix.vision.edge import SourceEdge
+from terrafix.vision.frame_rate import FrameRateLimit
 from terrafix.vision.sources import open_source
 from terrafix.vision.sources.camera import LiveCamera
 from terrafix.vision.sources.capture import Stamp
@@ -80,9 +84,7 @@ class FakeCamera:
     """A device that delivers ``frames`` images and is then unplugged."""
 
     def __init__(self, frames: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-        self.left = frames
-        self.shape = size
-        self.released = False
+        self.left, self.decoded, self.shape, self.released = frames, 0, size, False
         self.why = "unplugged"
 
     def grab(self) -> bool:
@@ -90,6 +92,7 @@ class FakeCamera:
         return self.left >= 0
 
     def retrieve(self) -> tuple[bool, np.ndarray]:
+        self.decoded += 1
         return True, picture(self.left, *self.shape)
 
     def stamp(self, arrival_ns: int) -> Stamp:
@@ -105,7 +108,7 @@ class FakeCamera:
         self.released = True
 
 
-def live(tmp_path: Path, devices: Iterable[FakeCamera | None], **more: bool) -> LiveCamera:
+def live(tmp_path: Path, devices: Iterable[FakeCamera | None], wait: bool = False) -> LiveCamera:
     description = tmp_path / "camera.toml"
     description.write_text(DESCRIPTION)
     supply = iter(devices)
@@ -115,9 +118,7 @@ def live(tmp_path: Path, devices: Iterable[FakeCamera | None], **more: bool) -> 
             raise SourceError(f"{spec}: the camera cannot be opened")
         return device
 
-    return LiveCamera(
-        "0", (1.0, 2.0), description, 1e6, open_capture=plug, reconnect_s=0.001, wait=more.get("wait", False)
-    )
+    return LiveCamera("0", (1.0, 2.0), description, 1e6, open_capture=plug, reconnect_s=0.001, wait=wait)
 
 
 def test_an_unplugged_camera_is_reconnected(tmp_path: Path) -> None:
@@ -133,6 +134,18 @@ def test_an_unplugged_camera_is_reconnected(tmp_path: Path) -> None:
     threading.Timer(0.05, camera.close).start()
     assert list(shots) == []  # ends when it is closed, also without a camera
     assert second.released
+
+
+def test_images_of_a_camera_that_are_not_taken_are_not_decoded(tmp_path: Path) -> None:
+    device, asked_ns, frames = FakeCamera(9), list[int](), list[Frame]()
+    rate = FrameRateLimit(HealthSection())
+    rate.takes_frame = lambda t_ns: asked_ns.append(t_ns) or len(asked_ns) % 3 == 1  # type: ignore[method-assign, func-returns-value]
+    edge = SourceEdge(live(tmp_path, [device]), MemoryFrameStore(), None, True, rate=rate)
+    while len(frames) < 3:
+        frames += [one for one in edge.poll(now_ns()) if isinstance(one, Frame)]
+    edge.close()
+    assert [frame.frame_id for frame in frames] == [0, 3, 6] and device.decoded == 3
+    assert [frame.t_ns for frame in frames] == asked_ns[::3] and len(asked_ns) == 9
 
 
 def test_a_camera_of_another_size_or_a_missing_camera_is_reported(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from terrafix.messages import GpsInput, NavEstimate
+from terrafix.messages import Frame, FrameRate, GpsInput, NavEstimate
 from terrafix.recorder.reader import read_flight
 from terrafix_lab.bench.intervals import IntervalStats, lines_of, measure
 from terrafix_lab.bench.result_file import write_result
@@ -37,6 +37,7 @@ from terrafix_lab.chaos.verdict import sigmas, wrong_fixes
 from terrafix_lab.faults.fault import Process
 from terrafix_lab.faults.processes import busy as beside
 from terrafix_lab.faults.table import fault_named
+from terrafix_lab.sim.flights.folder import FRAME_HZ
 from terrafix_lab.standalone import run_standalone
 
 SAMPLE_S = 10.0
@@ -132,20 +133,21 @@ def grows(found: dict[str, dict[str, float]]) -> list[str]:
 
 
 def output_of(record: Path) -> dict[str, Any]:
-    """Delay in the first and the last third of the flight, frames with an estimate a second, intervals of GPS_INPUT,
-    and how often a minute it changed between a fix and none, from the first one on."""
+    """Median delay from image to estimate by minute; images offered, taken and with an estimate a second; intervals of
+    GPS_INPUT, and how often a minute it changed between a fix and none, from the first one on."""
     messages = [message for _, _, message in read_flight(record)]
     has_fix = [m.fix_type >= 3 for m in messages if isinstance(m, GpsInput)]
     has_fix = has_fix[has_fix.index(True) :] if True in has_fix else []
     intervals = measure(messages)
     estimates = [m for m in messages if isinstance(m, NavEstimate) and m.emitted_at_ns]
-    delays = [(m.t_ns / 1e9, (m.emitted_at_ns - m.t_ns) / 1e6) for m in estimates]
-    times, ms = np.array(delays).T
-    cut_s = times.min() + np.array([1.0, 2.0]) * (times.max() - times.min()) / 3.0
+    times, ms = np.array([(m.t_ns / 1e9, (m.emitted_at_ns - m.t_ns) / 1e6) for m in estimates]).T
+    minutes, span_s = (times - times.min()) // 60.0, max(float(np.ptp(times)), 1.0)
+    offered_hz = [m.offered_hz for m in messages if isinstance(m, FrameRate)]
     return {
-        "delay_first_third_ms": float(np.median(ms[times <= cut_s[0]])),
-        "delay_last_third_ms": float(np.median(ms[times >= cut_s[1]])),
-        "frames_per_s": len({m.frame_id for m in estimates}) / max(float(np.ptp(times)), 1.0),
+        "delay_by_minute_ms": [float(np.median(ms[minutes == minute])) for minute in np.unique(minutes)],
+        "offered_per_s": float(np.mean(offered_hz)) if offered_hz else None,
+        "taken_per_s": sum(isinstance(m, Frame) and not m.error for m in messages) / span_s,
+        "frames_per_s": len({m.frame_id for m in estimates}) / span_s,
         "changes_per_min": 60.0 * sum(a != b for a, b in pairwise(has_fix)) / max(intervals.duration_s, 1.0),
         "gps_input": msgspec.to_builtins(intervals),
     }
@@ -166,10 +168,10 @@ def soak(scene: ChaosScene, out: Path, minutes: float, seed: int, process: Proce
             time.sleep(SAMPLE_S)
         fixes = rig.peer.fixes()
     found = growth(samples)
-    worst = max((sigmas(fix) for fix in fixes if fix.horizontal_m), default=math.nan)
-    result = {"minutes": minutes, "starts": rig.starts, "growth": found, "grows": grows(found), "worst_sigmas": worst}
-    result |= {"wrong": len(wrong_fixes(fixes)), "load": os.getloadavg()[0]}
-    return result | output_of(rig.out)
+    off = [sigmas(fix) for fix in fixes if fix.horizontal_m]
+    result = {"minutes": minutes, "starts": rig.starts, "growth": found, "grows": grows(found), "fixes": len(off)}
+    result |= {"worst_sigmas": max(off, default=math.nan), "over_3_sigmas": sum(sigma > 3.0 for sigma in off)}
+    return result | {"wrong": len(wrong_fixes(fixes)), "load": os.getloadavg()[0]} | output_of(rig.out)
 
 
 def show(result: dict[str, Any], console: Console) -> None:
@@ -181,10 +183,10 @@ def show(result: dict[str, Any], console: Console) -> None:
         table.add_row(name, f"{row['memory_mb']:.0f} MB", slope, f"{row['files_gained']:.0f}")
     console.print(table)
     shown = {
-        "image to estimate": f"{result['delay_first_third_ms']:.0f} ms in the first third",
-        "then": f"{result['delay_last_third_ms']:.0f} ms in the last",
+        "images a second": f"{result['offered_per_s'] or math.nan:.1f}, taken {result['taken_per_s']:.1f}",
+        "image to estimate by minute": ", ".join(f"{ms:.0f}" for ms in result["delay_by_minute_ms"]) + " ms",
         **lines_of(msgspec.convert(result["gps_input"], IntervalStats)),
-        "worst error": f"{result['worst_sigmas']:.1f} sigma",
+        "worst error": f"{result['worst_sigmas']:.1f} sigma, {result['over_3_sigmas']} of {result['fixes']} above 3",
         "grows": ", ".join(result["grows"]) or "nothing",
     }
     console.print("; ".join(f"{name} {value}" for name, value in shown.items()), highlight=False)
@@ -206,21 +208,21 @@ def main(
     out: Annotated[Path, typer.Argument(help="New folder; the flight in it is generated.")],
     minutes: Annotated[float, typer.Option(help="Of flight.")] = 120.0,
     seed: Annotated[int, typer.Option(help="Seed of the place and of the noise.")] = 1,
+    camera_hz: Annotated[float, typer.Option(help="Images a second, a multiple of 2.")] = FRAME_HZ,
     fault: Annotated[
         str, typer.Option(help="Fault of the processes during all of the flight, as 'processor: saturated'.")
     ] = "none",
     busy: Annotated[list[int] | None, typer.Option(help="Busy processes; may be given several times.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="JSON to write.")] = None,
 ) -> None:
-    console = Console(width=150)
+    console, scene = Console(width=150), shuttle_in(out, seed, camera_hz)
     if busy:
-        scene = shuttle_in(out, seed)
         results = {number: soak(scene, out / RUN / str(number), minutes, seed, beside(number)) for number in busy}
         console.print(load_table(results))
         write_result(json_file, {str(number): one for number, one in results.items()})
         raise typer.Exit(1 if any(one["wrong"] for one in results.values()) else 0)
     process = fault_named(fault).process or Process()
-    result = soak(shuttle_in(out, seed), out / RUN, minutes, seed, process)
+    result = soak(scene, out / RUN, minutes, seed, process)
     show(result, console)
     write_result(json_file, result)
     intervals = msgspec.convert(result["gps_input"], IntervalStats)

@@ -32,6 +32,7 @@ RESTART_S = 0.1  # RestartSec= of the systemd unit, whose part the rig takes
 START_LIMIT_S = 90.0  # until the camera is opened, on a computer that others use too
 STOP_LIMIT_S = 45.0  # TimeoutStopSec= of the unit
 START_SIGMA_M = 10.0  # of the start, which `terrafix run` states itself
+RATE_HZ = 20.0  # of images that are taken at most, where the camera is not faster
 SHARED_MB = 128  # shared memory of its own: frames take 18 MB, and descriptors of the map some more
 NONE = Path()
 
@@ -233,11 +234,11 @@ class Rig:
             )
         )
         start = f'start = "{stated.lat_deg:.6f},{stated.lon_deg:.6f}"\n' if math.isfinite(stated.start_sigma_m) else ""
-        camera = self.folder / "camera.toml"
+        camera, rate_hz = self.folder / "camera.toml", max(RATE_HZ, self.scene.frame_hz)
         camera.write_text(camera_toml(stated.camera, self.scene.attitude_sigma_deg))
         (self.folder / "terrafix.toml").write_text(
             f'[map]\npath = "{self.map_path}"\n'
-            f'[source]\npath = "{self.stream.url}"\ncamera = "{camera}"\nrate_hz = 20\n'
+            f'[source]\npath = "{self.stream.url}"\ncamera = "{camera}"\nrate_hz = {rate_hz}\n'
             f"{start}"
             f'[link]\ndevice = "{self.line.device if self.line else f"udpout:127.0.0.1:{port}"}"\n'
             f'[health]\nsysfs_root = "{self.folder / "sys"}"\n'

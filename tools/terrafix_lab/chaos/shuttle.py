@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafix.core.errors import OutputError
+from terrafix.core.errors import OutputError, UsageError
 from terrafix_lab.chaos.scene import COURSE, LEG_M, ChaosScene, course_of, mission_along
 from terrafix_lab.sim.autopilot.course import read_course
 from terrafix_lab.sim.autopilot.parameters import Kind
@@ -19,21 +19,24 @@ from terrafix_lab.sim.interfaces import State
 RUN = "run"  # folder of the run, beside that of the generated flight
 A, B, C = (0.0, 0.0), (LEG_M, 0.0), (LEG_M, LEG_M)  # east and north of the take-off
 WAY = (B, C, B, A, B)  # a lap from the middle of the first leg to that of the last, and what comes before and after
-PERIOD_STEPS = round(1.0 / FRAME_HZ / STEP_S)
+PERIOD_STEPS = round(1.0 / FRAME_HZ / STEP_S)  # whole periods of a camera at a multiple of FRAME_HZ, too
+MAX_CAMERA_HZ = 60.0  # [spec: files of a folder have four digits, a lap takes two minutes]
 AFTER_STEPS = round(0.2 / STEP_S)  # of the next lap: the course has a row at the end of the lap, and one after it
 
 Heights = Callable[[np.ndarray, np.ndarray], np.ndarray]  # east, north [m] (1, N) -> ground, metres AMSL (1, N)
 
 
-def shuttle_in(out: Path, seed: int) -> ChaosScene:
+def shuttle_in(out: Path, seed: int, camera_hz: float = FRAME_HZ) -> ChaosScene:
     """The endless scene of the flight in ``out``, which is generated if it is not there. Raises OutputError (``out``
-    has a run already), SourceError."""
+    has a run already), SourceError, UsageError."""
+    if not 0.0 < camera_hz <= MAX_CAMERA_HZ or camera_hz % FRAME_HZ:
+        raise UsageError(f"--camera-hz {camera_hz:g}: choose a multiple of {FRAME_HZ:g} up to {MAX_CAMERA_HZ:g}")
     if (out / RUN).exists():
         raise OutputError(f"{out / RUN}: exists; give a new folder")
-    folder = out / f"shuttle-{seed}"
+    folder = out / f"shuttle-{seed}-{camera_hz:g}hz"
     if not (folder / COURSE).exists():
-        _generate(folder, seed)
-    return endless(folder)
+        _generate(folder, seed, camera_hz)
+    return endless(folder, camera_hz)
 
 
 @dataclass(frozen=True)
@@ -45,18 +48,18 @@ class EndlessScene(ChaosScene):
         return self.jpegs[round(t_s * self.frame_hz) % len(self.jpegs)].read_bytes()
 
 
-def endless(folder: Path) -> ChaosScene:
+def endless(folder: Path, camera_hz: float = FRAME_HZ) -> ChaosScene:
     """The lap in ``folder`` (images, map, course) again and again. Raises SourceError."""
     course, jpegs = read_course(folder / COURSE), sorted((folder / "frames").glob("*.jpg"))
-    lap_s = len(jpegs) / FRAME_HZ
-    return EndlessScene(folder / MAP_NAME, jpegs, lambda t_s: course(t_s % lap_s), {}, math.inf)
+    lap_s = len(jpegs) / camera_hz
+    return EndlessScene(folder / MAP_NAME, jpegs, lambda t_s: course(t_s % lap_s), {}, math.inf, frame_hz=camera_hz)
 
 
-def _generate(folder: Path, seed: int) -> None:
+def _generate(folder: Path, seed: int, camera_hz: float) -> None:
     wanted = FlightOptions(seed=seed, vehicle=Kind.COPTER)
     scene, place = scene_of(wanted)
     flown = flight_over(scene, Kind.COPTER, seed=seed, mission=mission_along("shuttle", seed, WAY))
-    flight = lap_of(flown)
+    flight = replace(lap_of(flown), frame_hz=camera_hz)
     write_flight(folder, flight, MAP_NAME, seed=seed, telemetry=False)
     write_map(folder / MAP_NAME, wanted, place)
     course_of(flight, folder)  # last: what was cut off is generated anew

@@ -59,6 +59,7 @@ class LiveCamera(SourceBase):
         self._open = open_capture or self._open_capture
         self._reconnect_s = reconnect_s
         self._closed = threading.Event()
+        self._takes: Callable[[int], bool] = lambda _t_ns: True
         self._streaming = False
         self._late = False  # the last image was too late
         self._timing = timing
@@ -81,6 +82,10 @@ class LiveCamera(SourceBase):
             *([Fact("camera", f"read by {self._read_by}")] if self._read_by else []),
             Fact("clock", self._clock()),
         ]
+
+    def select(self, takes: Callable[[int], bool]) -> bool:
+        self._takes = takes
+        return True
 
     def close(self) -> None:
         """Ends ``shots``, from any thread; the thread that runs ``shots`` releases the device.
@@ -110,9 +115,9 @@ class LiveCamera(SourceBase):
                 stamp = self._stamp(capture, arrival_ns)
                 if self._is_late(arrival_ns - stamp.t_ns) or stamp.t_ns < due_ns:
                     continue
-                t_ns = stamp.t_ns
-                due_ns = max(due_ns + self._period_ns, t_ns + self._period_ns // 2)  # keeps the mean rate, no bursts
-                yield self._shot(capture, frame_id, stamp)
+                due_ns = max(due_ns, stamp.t_ns - self._period_ns // 2) + self._period_ns  # the mean rate, no bursts
+                if self._takes(stamp.t_ns):
+                    yield self._shot(capture, frame_id, stamp)
                 frame_id += 1
         finally:
             self._streaming = False
@@ -120,19 +125,13 @@ class LiveCamera(SourceBase):
 
     def _is_late(self, age_ns: int) -> bool:
         """Whether an image that arrives ``age_ns`` after its stamp is left out. Beginning and end are in the log."""
-        late = age_ns > MAX_LATE_NS
-        if late != self._late:
-            self._late = late
-            if late:
-                logs.get().warning(
-                    "images too late",
-                    source=self._shown,
-                    age_s=round(age_ns / 1e9, 1),
-                    todo="compare the clock of the camera's time stamps; shorten its buffers",
-                )
-            else:
-                logs.get().info("images in time again", source=self._shown)
-        return late
+        before, self._late = self._late, age_ns > MAX_LATE_NS
+        if self._late and not before:
+            todo = "compare the clock of the camera's time stamps; shorten its buffers"
+            logs.get().warning("images too late", source=self._shown, age_s=round(age_ns / 1e9, 1), todo=todo)
+        elif before and not self._late:
+            logs.get().info("images in time again", source=self._shown)
+        return self._late
 
     def _stamp(self, capture: Capture, arrival_ns: int) -> Stamp:
         stamp = capture.stamp(arrival_ns)
@@ -153,12 +152,11 @@ class LiveCamera(SourceBase):
         error = "" if decoded else "cannot be decoded"
         if image is not None and image.shape != (camera.height, camera.width, 3):
             error = f"wrong size: {image.shape[1]}x{image.shape[0]}, the camera says {camera.width}x{camera.height}"
-        if error != self._error:
-            self._error = error
-            if error:
-                logs.get().warning("images cannot be used", source=self._shown, why=error)
-            else:
-                logs.get().info("images can be used again", source=self._shown)
+        if error and error != self._error:
+            logs.get().warning("images cannot be used", source=self._shown, why=error)
+        elif self._error and not error:
+            logs.get().info("images can be used again", source=self._shown)
+        self._error = error
         frame = Frame(
             t_ns=stamp.t_ns,
             frame_id=frame_id,
@@ -180,18 +178,16 @@ class LiveCamera(SourceBase):
     def _try_open(self) -> Capture | None:
         """Opens the capture; None on failure, since in flight a missing camera is not a configuration error."""
         try:
-            capture = self._opened()
+            return self._opened()
         except SourceError as error:
             if str(error) != self._error and not self._closed.is_set():
                 self._error = str(error)
                 logs.get().warning("camera not available", source=self._shown, why=str(error))
             return None
-        self._error = ""
-        return capture
 
     def _opened(self) -> Capture:
         capture = self._open(self.spec, self._origin.camera)
-        self._read_by = capture.described()
+        self._error, self._read_by = "", capture.described()
         logs.get().info("camera connected", source=self._shown, by=self._read_by)
         return capture
 

@@ -1,6 +1,6 @@
 """The source contract: the common interface of flight folders, photo folders, videos and cameras."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -67,6 +67,10 @@ class Source(Protocol):
         """Shots from ``from_s`` on. Earlier ones are skipped without reading their pixels; frame ids do not change."""
         ...
 
+    def select(self, takes: Callable[[int], bool]) -> bool:
+        """Leaves frames out unread for which ``takes`` (t_ns), asked once for each, is false. -> False: it cannot."""
+        ...
+
     def map_hint(self) -> Path | None:
         """Resolved path of the map that the flight names; the file may not exist."""
         ...
@@ -88,6 +92,9 @@ class SourceBase:
     def length(self) -> int | None:
         return None
 
+    def select(self, takes: Callable[[int], bool]) -> bool:
+        return False
+
     def map_hint(self) -> Path | None:
         return None
 
@@ -106,6 +113,9 @@ class WrappedSource:
 
     def length(self) -> int | None:
         return self._source.length()
+
+    def select(self, takes: Callable[[int], bool]) -> bool:
+        return self._source.select(takes)
 
     def map_hint(self) -> Path | None:
         return self._source.map_hint()

@@ -100,7 +100,7 @@ def test_descriptors_are_covered_by_checksum_and_hashes(tmp_path: Path) -> None:
     package = MapPackage.open(path)
     index = CoarseDescriptors(package.bind(LocalFrame(LAT_DEG, LON_DEG)), PooledGradientDescriber())
     _, valid, *_ = index.window(-500.0, 500.0, 120, 120, index.gsd_m(2.1))
-    assert not valid.any() and package.damaged_tiles  # in flight it counts as missing
+    assert not valid.any() and package.tiles.damaged  # in flight it counts as missing
 
 
 def test_pooled_descriptors_are_means_of_dense_ones() -> None:

@@ -78,7 +78,7 @@ def test_an_altered_tile_is_missing_in_flight_and_an_error_when_verified(package
     opened = MapPackage.open(package)
     image, valid = bound(opened).window(-100.0, 100.0, 400, 400, 0.5)
     assert 0.2 < valid.mean() < 0.8 and not image[~valid].any()
-    assert opened.damaged_tiles == {("imagery", 2, 1, 1)}
+    assert opened.tiles.damaged == {("imagery", 2, 1, 1)}
     with pytest.raises(MapError, match="zoom 2 column 1 row 1"):
         opened.verify()
     opened.close()
@@ -110,7 +110,7 @@ def everything(path: Path, *, verify: bool = True) -> tuple[object, ...]:
         roads = opened.features("roads", west - 1, south - 1, east + 1, north + 1)
         features = [(f.kind, f.name, f.attributes, [p.tobytes() for p in f.parts]) for f in roads]
         heights = None if up is None else up.tobytes()
-        assert not opened.damaged_tiles
+        assert not opened.tiles.damaged
         return opened.manifest, image.tobytes(), valid.tobytes(), far.tobytes(), heights, features
     finally:
         opened.close()

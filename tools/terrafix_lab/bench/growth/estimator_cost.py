@@ -17,14 +17,17 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import B, C, V
 
 from terrafix.estimator.estimator import Estimator
 from terrafix.estimator.filter_state import FrameInput
 from terrafix.estimator.graph.marginalized import MarginalizedHistory
 from terrafix.estimator.graph.pose_graph import PoseGraph
+from terrafix.estimator.map_update import MapResult
 from terrafix.estimator.measurements.telemetry_buffer import Telemetry
+from terrafix.estimator.propagation import PropagationResult
 from terrafix.messages import Imu, VehicleState
-from terrafix_lab.bench.growth.stream import frame_messages, origin
+from terrafix_lab.bench.growth.stream import FrameMessages, frame_messages, origin
 from terrafix_tools.replay import peak_memory_mb
 from terrafix_tools.timing import spread
 
@@ -32,6 +35,9 @@ LAST = 80  # last frames of the flight, for the statistics of the time per frame
 LATER = 500  # last frames for the statistics of the graph alone: more, for the 99th percentile
 QUERIES = 10  # covariance queries from scratch
 QUERIED_BEFORE = 10  # number of nodes from the queried one to the newest: the middle of the window
+
+
+Flown = tuple[FrameMessages, PropagationResult, MapResult | None, float]
 
 
 class _TimedGraph(PoseGraph):
@@ -76,9 +82,9 @@ class _WholeFlight(MarginalizedHistory):
     def marginalize(self, nodes: list[int], estimate: gtsam.Values) -> None:
         super().marginalize(nodes, estimate)
         for node in nodes:
-            self.values.insert(_camera(node), estimate.atPose3(_camera(node)))
-            self.values.insert(_bias(node), estimate.atVector(_bias(node)))
-            self.values.insert(_velocity(node), estimate.atVector(_velocity(node)))
+            self.values.insert(C(node), estimate.atPose3(C(node)))
+            self.values.insert(B(node), estimate.atVector(B(node)))
+            self.values.insert(V(node), estimate.atVector(V(node)))
 
     def linear(self) -> gtsam.NonlinearFactorGraph:
         """-> all factors, linearized. Factors in Python are slow in a large graph, because GTSAM copies all values for
@@ -88,7 +94,7 @@ class _WholeFlight(MarginalizedHistory):
             factor = self.factors.at(i)
             point = gtsam.Values()
             for key in factor.keys():  # noqa: SIM118 (a factor is not a dict)
-                is_pose = key == _camera(gtsam.symbolIndex(key))
+                is_pose = key == C(gtsam.symbolIndex(key))
                 point.insert(key, self.values.atPose3(key) if is_pose else self.values.atVector(key))
             graph.push_back(gtsam.LinearContainerFactor(factor.linearize(point), point))
         return graph
@@ -101,11 +107,11 @@ def measure(frames: int) -> dict[str, Any]:
     times_ms: list[float] = []
     update_ms: list[float] = []
     query_ms: list[float] = []
-    for frame_ms in _flown(estimator, frames):
+    for *_, frame_ms in flown(estimator, frames):
         times_ms.append(frame_ms)
         update_ms.append(graph.spent_ms)
         # Not the newest node: the smoother has computed its covariance in this frame.
-        query_ms.append(_ms(partial(estimator.graph.covariance, max(0, estimator.graph.newest - QUERIED_BEFORE))))
+        query_ms.append(_ms(partial(estimator.graph.covariance, _queried(estimator.graph))))
         graph.spent_ms = 0.0
     in_flight_mb = peak_memory_mb()
     began_s = time.process_time()
@@ -124,8 +130,8 @@ def measure(frames: int) -> dict[str, Any]:
     }
 
 
-def _flown(estimator: Estimator, frames: int) -> Iterator[float]:
-    """-> processor time of each frame [ms], with all messages since the previous one."""
+def flown(estimator: Estimator, frames: int) -> Iterator[Flown]:
+    """-> each frame, what the estimator made of it, and its processor time [ms] with all messages since the last."""
     telemetry = Telemetry()
     for frame in frame_messages(frames):
         began_s = time.process_time()
@@ -137,27 +143,30 @@ def _flown(estimator: Estimator, frames: int) -> Iterator[float]:
         t_ns = frame.odometry.t_ns
         attitude = telemetry.at(t_ns)
         imu = telemetry.world_acceleration
-        estimator.feed_frame(FrameInput(frame.odometry.frame_id, t_ns * 1e-9, frame.odometry, attitude, imu))
-        if frame.match is not None:
-            estimator.feed_map_match(frame.match)
-        yield (time.process_time() - began_s) * 1e3
+        new = FrameInput(frame.odometry.frame_id, t_ns * 1e-9, frame.odometry, attitude, imu)
+        propagated = estimator.feed_frame(new)
+        matched = None if frame.match is None else estimator.feed_map_match(frame.match)
+        yield frame, propagated, matched, (time.process_time() - began_s) * 1e3
+
+
+def _queried(graph: PoseGraph) -> int:
+    """-> QUERIED_BEFORE nodes before the newest, or the oldest node of a graph that has begun anew since."""
+    return graph.window[-1 - QUERIED_BEFORE :][0]
 
 
 def _from_scratch(frames: int) -> dict[str, dict[str, float]]:
     """-> times of the same covariance query with ``gtsam.Marginals``, after the same flight."""
     flight = _WholeFlight()
     estimator = Estimator(origin(), graph=PoseGraph(flight))
-    for _ in _flown(estimator, frames):
+    for _ in flown(estimator, frames):
         pass
-    newest = estimator.graph.newest
-    in_window = {n for n in range(newest + 1) if estimator.graph.holds(n)}
+    in_window, queried = set(estimator.graph.window), C(_queried(estimator.graph))
     estimator.graph.refine()
     factors = flight.linear()
     graphs = {
         "window": (_window(factors, flight.values, in_window), QUERIES),
         "whole flight": ((factors, flight.values), 2),
     }
-    queried = _camera(newest - QUERIED_BEFORE)
     return {
         f"gtsam.Marginals, {name}": spread(
             [_ms(lambda: gtsam.Marginals(*graph).marginalCovariance(queried)) for _ in range(count)]  # noqa: B023
@@ -176,26 +185,14 @@ def _window(
         if all(gtsam.symbolIndex(key) in nodes for key in factor.keys()):  # noqa: SIM118
             factors.push_back(factor)
     for n in nodes:
-        values.insert(_camera(n), all_values.atPose3(_camera(n)))
-        values.insert(_bias(n), all_values.atVector(_bias(n)))
-        values.insert(_velocity(n), all_values.atVector(_velocity(n)))
+        values.insert(C(n), all_values.atPose3(C(n)))
+        values.insert(B(n), all_values.atVector(B(n)))
+        values.insert(V(n), all_values.atVector(V(n)))
     first, unit = min(nodes), gtsam.noiseModel.Isotropic.Sigma
-    factors.add(gtsam.PriorFactorPose3(_camera(first), values.atPose3(_camera(first)), unit(6, 1.0)))
-    for key in (_bias(first), _velocity(first)):
+    factors.add(gtsam.PriorFactorPose3(C(first), values.atPose3(C(first)), unit(6, 1.0)))
+    for key in (B(first), V(first)):
         factors.add(gtsam.PriorFactorVector(key, values.atVector(key), unit(len(values.atVector(key)), 1.0)))
     return factors, values
-
-
-def _camera(node: int) -> int:
-    return int(gtsam.symbol("c", node))
-
-
-def _bias(node: int) -> int:
-    return int(gtsam.symbol("b", node))
-
-
-def _velocity(node: int) -> int:
-    return int(gtsam.symbol("v", node))
 
 
 def _ms(work: Callable[[], object]) -> float:

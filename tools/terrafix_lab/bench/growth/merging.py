@@ -41,9 +41,6 @@ class SubmapFlight:
     r_w_c: list[np.ndarray]
     p_w_m: list[np.ndarray]
 
-    def inlier_anchors(self) -> list[AbsoluteConstraint]:
-        return [a for a, wrong in zip(self.anchors, self.wrong, strict=True) if not wrong]
-
 
 def make_submap_flight(
     seed: int,
