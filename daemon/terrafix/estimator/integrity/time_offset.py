@@ -103,13 +103,18 @@ class Contradiction:
         return np.asarray(np.exp(-0.5 * distance2) / (2.0 * np.pi * np.sqrt(np.linalg.det(self._cov_m2))))
 
     @property
-    def density_across(self) -> float:
-        """Likelihood [1/m] of a wrong motion along the velocity."""
+    def across_m(self) -> tuple[float, float]:
+        """Distance from the way that was flown, and its variance [m^2]."""
         speed_mps = float(np.hypot(*self.velocity_mps))
         east, north = self.velocity_mps / speed_mps if speed_mps > 0.0 else np.array([1.0, 0.0])
         across = np.array([-north, east])
-        variance_m2 = float(across @ self._cov_m2 @ across)
-        return float(np.exp(-0.5 * (across @ self.off.residual) ** 2 / variance_m2) / np.sqrt(2 * np.pi * variance_m2))
+        return float(across @ self.off.residual), float(across @ self._cov_m2 @ across)
+
+    @property
+    def density_across(self) -> float:
+        """Likelihood [1/m] of a wrong motion along the velocity."""
+        across_m, variance_m2 = self.across_m
+        return float(np.exp(-0.5 * across_m**2 / variance_m2) / np.sqrt(2 * np.pi * variance_m2))
 
 
 @dataclass(frozen=True)
@@ -228,11 +233,11 @@ class TimeOffset:
         self._mass, self._at_ns, self._density = mass / mass.sum(), max(seen.t_ns, self._at_ns or seen.t_ns), None
 
     def _refute_jump(self, seen: Contradiction) -> None:
-        """Images that only come at another time move as the vehicle does from the first of them on."""
+        """Images that only come at another time move along the way that was flown from the first of them on."""
         if self._before_jump is None or "map" in self._contradicted:
             return
-        jumped_ns, mass = self._before_jump
-        if self._stamps_ns.get(seen.keyframe_id, -1) >= jumped_ns:
+        (jumped_ns, mass), (across_m, variance_m2) = self._before_jump, seen.across_m
+        if across_m**2 > GATE[1] * variance_m2 and self._stamps_ns.get(seen.keyframe_id, -1) >= jumped_ns:
             self.forget_images()
             self._mass, self._density, self._jumps = mass, None, False
 

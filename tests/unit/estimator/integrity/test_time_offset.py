@@ -333,15 +333,17 @@ def test_a_vehicle_that_hovers_learns_nothing_of_the_time_from_an_image_that_jum
 
 
 @pytest.mark.parametrize(
-    ("keyframe_ns", "by_map", "late_s"), [(0, False, 1.4), (10**9, False, 0.0), (10**9, True, 1.4)]
+    ("keyframe_ns", "north_m", "by_map", "late_s"),
+    [(0, 30.0, False, 1.4), (10**9, 30.0, False, 0.0), (10**9, 0.5, False, 1.4), (10**9, 30.0, True, 1.4)],
 )
 def test_images_that_jump_and_go_on_with_impossible_motions_tell_nothing_of_the_time(
-    keyframe_ns: int, late_s: float, *, by_map: bool
+    keyframe_ns: int, north_m: float, late_s: float, *, by_map: bool
 ) -> None:
-    """The next motion, since a keyframe before or after the jump; the map may have confirmed that."""
+    """The next motion, since a keyframe before or after the jump, beside the track or along it; the map may have
+    confirmed the jump."""
     offset = TimeOffset(R_B_C)
     offset.buffered, offset._stamps_ns = True, {7: keyframe_ns}
-    for at_ns, off_m in ((10**9, (-28.0, 0.5)), (2 * 10**9, (5.0, 30.0))):
+    for at_ns, off_m in ((10**9, (-28.0, 0.5)), (2 * 10**9, (-5.0, north_m))):
         seen = Contradiction(at_ns, Innovation(np.array(off_m), np.eye(2), GATE[2]), np.array([20.0, 0.0]), 120.0, 7)
         offset.contradict(seen, Telemetry(), by_map=False)
         if by_map:
