@@ -12,7 +12,7 @@ CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
 LINES = {"daemon": 41925, "engines": 1678, "tools": 64346, "tests": 70070}
-WORDS = 68301  # of all documents
+WORDS = 68307  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 
 
