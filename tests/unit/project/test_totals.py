@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[3]
 CODE = (".py", ".js", ".css")
 SLACK = 0.01  # a total that is lower by more than this share lowers its limit, so that it cannot rise again
 
-LINES = {"daemon": 41925, "engines": 1678, "tools": 64346, "tests": 70070}
+LINES = {"daemon": 41925, "engines": 1678, "tools": 64346, "tests": 70080}
 WORDS = 68307  # of all documents
 README_LINES, CHANGELOG_LINES = 150, 60
 

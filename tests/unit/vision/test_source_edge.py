@@ -182,3 +182,13 @@ def test_in_a_hot_computer_frames_above_the_rate_are_left_out_in_real_time_and_t
     assert [(f.frame_id, f.error) for f in listener.frames] == [(i, "") for i in range(0, 20, every)]
     assert len([x for x in listener.messages if isinstance(x, m.VehicleState)]) == 20
     assert listener.messages[-1].frames == 20  # type: ignore[attr-defined]
+
+
+def test_a_recording_that_is_not_played_in_real_time_is_read_whole_in_a_hot_computer(
+    tmp_path: Path, listen: Listen
+) -> None:
+    limit = FrameRateLimit(HealthSection(hot_rate_hz=5.0))
+    limit.band = m.ThermalBand.HOT
+    listener = listen(flight(tmp_path / "f", 12, step_s=0.05), realtime=False, rate=limit)
+    listener.until(listener.ended)
+    assert len(listener.frames) == 12
